@@ -75,7 +75,6 @@ class CameraTrack:
         over a sample of its pixels; 0 of the first; shape (pictures,). ``altered`` is the share of
         pixels that differ at all.
     :param digests: of each picture as it was decoded; equal for equal pictures, shape (pictures,).
-    :param keys: whether each is coded by itself, not as a difference, shape (pictures,).
     :param trouble: why nothing, or not all of it, could be read, as a sentence without its subject.
     :param absent: the file is not there.
     :param length: seconds that the source has for this episode; None where it does not say.
@@ -89,7 +88,6 @@ class CameraTrack:
     changes: Floats = field(default_factory=lambda: np.zeros(0))
     altered: Floats = field(default_factory=lambda: np.zeros(0))
     digests: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
-    keys: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     trouble: str = ""
     absent: bool = False
     length: float | None = None
@@ -104,7 +102,6 @@ class _Collector:
 
     def __init__(self) -> None:
         self._t: list[float] = []
-        self._keys: list[bool] = []
         self._samples: list[Grey] = []
         self._thumbs: list[Grey] = []
         self._digests: list[int] = []
@@ -114,14 +111,13 @@ class _Collector:
     def __len__(self) -> int:
         return len(self._t)
 
-    def add(self, t: float, sample: Grey, key: bool = True) -> None:
+    def add(self, t: float, sample: Grey) -> None:
         """Add a picture, given by a sample of its pixels, shape (height, width)."""
         if self._samples and (
             len(self._samples) == _AT_ONCE or self._samples[0].shape != sample.shape
         ):
             self._reduce()
         self._t.append(t)
-        self._keys.append(key)
         self._samples.append(sample)
 
     def _reduce(self) -> None:
@@ -145,7 +141,7 @@ class _Collector:
         if self._samples:
             self._reduce()
         if self._t:
-            track.t, track.keys = np.array(self._t), np.array(self._keys)
+            track.t = np.array(self._t)
             track.thumbs = np.concatenate(self._thumbs)
             track.changes = np.concatenate([c for c, _ in self._differences])
             track.altered = np.concatenate([a for _, a in self._differences])
@@ -296,7 +292,7 @@ def _collect(
         if len(collector) >= most:
             track.trouble = f"it has more than {most} pictures in {len(episode)} frames"
             break
-        collector.add(seconds - begin, _sample_of_frame(frame), bool(frame.key_frame))
+        collector.add(seconds - begin, _sample_of_frame(frame))
     if video.damaged:
         track.trouble = f"{video.damaged} pieces of its video are damaged"
 

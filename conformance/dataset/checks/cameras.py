@@ -9,22 +9,23 @@ and the picture leaps where the stretch ends, or where its own noise stops.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from dexkit.conformance.dataset.camera_lag import DRIFT, Lag, Motion, motion_of
 from dexkit.conformance.dataset.cameras import CameraTrack, tracks_of
 from dexkit.conformance.dataset.check import Check, Data, Figure
-from dexkit.conformance.dataset.episode import Episode, Track
+from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding, Use
-from dexkit.conformance.dataset.motion import runs_of, stroke
+from dexkit.conformance.dataset.motion import runs_of
 from dexkit.escaping import one_line
 from dexkit.hand import Floats
 
-__all__ = ["CHECKS", "Lag", "Motion", "camera_findings", "frozen", "late", "missing", "motion_of"]
+__all__ = ["CHECKS", "camera_findings", "frozen", "late", "missing"]
 
 Mask = NDArray[np.bool_]
 
@@ -42,107 +43,24 @@ _REFRESH = 0.5  # s in which a codec shows a sensor's noise at least once
 _STEP = 0.25  # s of a window in which joints and picture are compared
 _STILL = 3  # grey levels of a block, that coding alone changes in a picture that is the same
 _ANSWER = 6  # levels by which a block changes where something moves in it
-_DEAD = 0.01  # of a joint's stroke, which noise of the encoder may be
 _MOVES = 0.02  # strokes, all joints together, in a window in which something moves
 _LEAST_MOTION = 0.15  # strokes within a frozen stretch; less may be out of sight
-_ANSWERS = 0.9  # share of comparable windows elsewhere in which the picture answers
+_ANSWERS = 0.7  # share of comparable windows elsewhere in which the picture answers
+_STRAY = 0.1  # share of a frozen stretch's windows in which coding looks like an answer
+_SHOWN = 15  # levels by which a block differs where something is in it
 _LEAST_COMPARABLE = 6  # of such windows: 1.5 s
 _LEAST_SEEN = 4  # windows of a stretch, each with such company elsewhere
 _LEAST_LEAP = 0.3  # levels on average: a block in a hundred changes by 30
+_ALL_NOISE = 0.3  # share of pixels that change in every picture, also where little moves
+_LEAST_REST = 1.5  # s at rest, to know the noise by
+_LEAST_ALIVE = 0.25  # of the pictures in it that show noise: a codec with key frames has a tenth
 _LEAST_RESTS = 8  # pictures to compare with
+_FAR = 1.8  # times the largest step after it, or at such a speed of the joints
 _LEAP = 1.5  # times the step after it, by which a frozen picture leaps when it goes on
 _NOISE = 0.05  # share of pixels that noise changes from picture to picture
 
 # camera-late
-_LATEST = 2.0  # s that are looked at
 _LATENCY = 0.3  # s that a camera and its network may take
-_CLEAR, _CLEARER = 0.6, 0.12  # correlation of a clear peak, and how much better than elsewhere
-_LEAST_LENGTH = 6.0  # s of an episode; in a shorter one anything may correlate
-_DRIFT = 0.25  # s between start and end
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """How the parts of a robot move.
-
-    :param t: of the frames, s, shape (frames,).
-    :param positions: of every joint that moves at all, in strokes, shape (frames, joints).
-    :param part: of each joint, the index of its part, shape (joints,).
-    :param parts: their names.
-    """
-
-    t: Floats
-    positions: Floats
-    part: NDArray[np.intp]
-    parts: tuple[str, ...]
-
-    @cached_property
-    def speed(self) -> Floats:
-        """Strokes a second, all joints of each part together, shape (frames, parts)."""
-        found = np.zeros((len(self.t), len(self.parts)))
-        if len(self.t) > 1 and self.positions.shape[1]:
-            smooth = _smooth(self.positions, max(1, round(0.1 / self._period)))
-            speeds = np.abs(np.gradient(smooth, self.t, axis=0))
-            for i in range(len(self.parts)):
-                found[:, i] = speeds[:, self.part == i].sum(axis=1)
-        return found
-
-    @property
-    def _period(self) -> float:
-        return float(np.median(np.diff(self.t)))
-
-    def travel(self, begin: Floats, end: Floats) -> Floats:
-        """How far each part gets between two times, in strokes, shape (times, parts).
-
-        What noise of an encoder may be does not count.
-        """
-        found = np.zeros((len(begin), len(self.parts)))
-        if not self.positions.shape[1]:
-            return found
-        a, b = (np.clip(np.searchsorted(self.t, x), 0, len(self.t) - 1) for x in (begin, end))
-        way = np.maximum(np.abs(self.positions[b] - self.positions[a]) - _DEAD, 0.0)
-        for i in range(len(self.parts)):
-            found[:, i] = way[:, self.part == i].sum(axis=1)
-        return found
-
-
-@lru_cache(maxsize=1)
-def motion_of(episode: Episode) -> Motion:
-    """What moves in an episode: what was observed, or else commanded."""
-    columns, parts = [], []
-    for number, track in enumerate(episode.tracks):
-        values = _positions(track)
-        if values is not None:
-            columns.append(values)
-            parts += [number] * values.shape[1]
-    shape = (len(episode), 0)
-    positions = np.concatenate(columns, axis=1) if columns else np.zeros(shape)
-    names = tuple(track.part for track in episode.tracks)
-    return Motion(episode.t, positions, np.array(parts, np.intp), names)
-
-
-def _positions(track: Track) -> Floats | None:
-    """Positions in strokes, without gaps; None where the part has none."""
-    values = track.state if track.state is not None else track.action
-    if values is None or not len(values):
-        return None
-    values = values / stroke(track)
-    finite = np.isfinite(values)
-    if not finite.all():
-        # the newest that is known
-        rows = np.where(finite, np.arange(len(values))[:, None], 0)
-        values = np.nan_to_num(np.take_along_axis(values, np.maximum.accumulate(rows), axis=0))
-    return np.asarray(values)
-
-
-def _smooth(values: Floats, width: int) -> Floats:
-    """Means over ``width`` rows around each."""
-    if width < 2:
-        return values
-    padded = np.concatenate([values[:1].repeat(width // 2, 0), values])
-    padded = np.concatenate([padded, values[-1:].repeat(width - 1 - width // 2, 0)])
-    sums = np.cumsum(np.concatenate([np.zeros_like(padded[:1]), padded]), axis=0)
-    return np.asarray((sums[width:] - sums[:-width]) / width)
 
 
 def _part(track: CameraTrack) -> str:
@@ -245,10 +163,11 @@ def _blank(track: CameraTrack, motion: Motion) -> Iterator[Finding]:
 # ------------------------------------------------------------------------------------
 
 
-def frozen(track: CameraTrack, motion: Motion, late_by: float = 0.0) -> Iterator[Finding]:
+def frozen(track: CameraTrack, motion: Motion, late_by: Floats | None = None) -> Iterator[Finding]:
     """A picture that stands still, while the joints move as they do where it does not.
 
-    :param track: with the times of what is seen, ``late_by`` seconds before its pictures.
+    :param track: with the times of what is seen, ``late_by`` seconds before its pictures, shape
+        (pictures,).
     """
     if len(track) < 4 or len(motion.t) < 4:
         return
@@ -257,13 +176,16 @@ def frozen(track: CameraTrack, motion: Motion, late_by: float = 0.0) -> Iterator
         if end - begin >= len(track) - 2:
             yield from _always_still(track, motion)
             return
-    found = [(b, e) for b, e in runs if _is_frozen(track, motion, b, e, runs)]
+    found = [(b, e) for b, e in runs if _is_frozen(track, motion, b, e)]
     if not found:
         return
-    spans = [(float(track.t[b]) + late_by, float(track.t[e - 1]) + late_by) for b, e in found]
-    total = sum(b - a for a, b in spans)
-    first, last = max(spans, key=lambda s: s[1] - s[0])
-    busiest = int(np.argmax(_path(motion, first - late_by, last - late_by)))
+    seen_at = track.t if late_by is None else track.t + late_by
+    begin, end = max(found, key=lambda run: track.t[run[1] - 1] - track.t[run[0]])
+    spans = [_same(track, b, e) for b, e in found]
+    total = float(sum(seen_at[e - 1] - seen_at[b] for b, e in spans))
+    busiest = int(np.argmax(_path(motion, float(track.t[begin]), float(track.t[end - 1]))))
+    begin, end = max(spans, key=lambda run: seen_at[run[1] - 1] - seen_at[run[0]])
+    first, last = float(seen_at[begin]), float(seen_at[end - 1])
     more = f", and {len(spans) - 1} more times" if len(spans) > 1 else ""
     text = (
         f"its picture stands still from {first:.2f} to {last:.2f} s{more}, while "
@@ -271,6 +193,13 @@ def frozen(track: CameraTrack, motion: Motion, late_by: float = 0.0) -> Iterator
     )
     use = _serious(total, motion)
     yield Finding("camera-frozen", use, text, _part(track), (), first, last, total, _LEAST, "s")
+
+
+def _same(track: CameraTrack, begin: int, end: int) -> tuple[int, int]:
+    """A still stretch from the first to the last pictures of it that are equal, if any are."""
+    equal = track.altered[begin + 1 : end] == 0
+    runs = list(runs_of(equal, 4))
+    return (begin + runs[0][0], begin + runs[-1][1] + 1) if runs else (begin, end)
 
 
 def _path(motion: Motion, begin: float, end: float) -> Floats:
@@ -323,37 +252,41 @@ def _still_runs(track: CameraTrack) -> list[tuple[int, int]]:
     return found
 
 
-def _is_frozen(
-    track: CameraTrack, motion: Motion, begin: int, end: int, runs: Sequence[tuple[int, int]]
-) -> bool:
+def _is_frozen(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool:
     first, last = float(track.t[begin]), float(track.t[end - 1])
     if _path(motion, first, last).sum() < _LEAST_MOTION:
         return False
     if _noise_stops(track, motion, begin, end):
         return True
     leap = _leap(track, end)
-    if leap is not None and _is_unexplained(track, motion, leap, runs):
+    if leap is not None and _is_unexplained(track, motion, leap):
         return True
-    if not _would_answer(track, motion, begin, end):
-        return False
-    if end < len(track):
-        return leap is not None
-    return begin == 0 or _stops_short(track, begin)
+    # what moves may leave the view; then the picture shows it no more
+    ends = end >= len(track) - 3
+    goes_on = _shows_something(track, begin, end) if ends else _is_far(track, leap)
+    return goes_on and _would_answer(track, motion, begin, end)
 
 
 def _noise_stops(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool:
     """Whether a sensor's noise, which changes pictures even where nothing moves, is gone."""
     period = float(np.median(np.diff(track.t)))
     width = max(2, round(_REFRESH / period))
-    if len(track) < 4 * width or np.mean(track.altered[begin + 1 : end] > 0) > 0.1:
+    inside = track.altered[begin + 1 + width // 2 : end]  # coding may end what it had begun
+    if len(track) < 4 * width or inside.max(initial=0.0) > _NOISE / 5:
         return False
+    outside = np.concatenate([track.altered[1:begin], track.altered[end + 1 :]])
+    if len(outside) >= 4 * width and np.quantile(outside, 0.02) > _ALL_NOISE:
+        return True
     # the codec may leave noise out of most pictures, and has it in some of each half second
     alive = sliding_window_view(track.altered[1:], width).max(axis=1)
     starts, ends = track.t[: len(alive)], track.t[width : width + len(alive)]
     rests = motion.travel(starts, ends).sum(axis=1) < _MOVES / 2
     elsewhere = (np.arange(len(alive)) + width < begin) | (np.arange(len(alive)) >= end)
     rests &= elsewhere
-    return int(rests.sum()) >= _LEAST_RESTS and bool(np.quantile(alive[rests], 0.05) > _NOISE)
+    if rests.sum() * period < _LEAST_REST or np.quantile(alive[rests], 0.05) <= _NOISE:
+        return False
+    # not only key frames, which differ without any noise
+    return bool(np.mean(track.altered[1 : len(alive) + 1][rests] > _NOISE) > _LEAST_ALIVE)
 
 
 def _would_answer(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool:
@@ -369,9 +302,9 @@ def _would_answer(track: CameraTrack, motion: Motion, begin: int, end: int) -> b
     answers = difference.max(axis=1) >= _ANSWER
     here = (at >= first) & (at + _STEP <= last) & (total > _MOVES)
     outside = ((at + _STEP < first) | (at > last)) & (total > _MOVES)
-    if not here.any() or answers[here].mean() > 1 - _ANSWERS:
+    if not here.any() or answers[here].mean() > _STRAY:
         return False
-    seen = 0
+    shares = []
     for window in np.flatnonzero(here).tolist():
         # no part moves more there than here, and all together not much less
         comparable = (
@@ -380,8 +313,8 @@ def _would_answer(track: CameraTrack, motion: Motion, begin: int, end: int) -> b
             & (total >= 0.3 * total[window])
         )
         if comparable.sum() >= _LEAST_COMPARABLE:
-            seen += bool(answers[comparable].mean() >= _ANSWERS)
-    return seen >= _LEAST_SEEN
+            shares.append(float(answers[comparable].mean()))
+    return len(shares) >= _LEAST_SEEN and float(np.mean(shares)) >= _ANSWERS
 
 
 def _steps(track: CameraTrack) -> Floats:
@@ -402,15 +335,21 @@ def _leap(track: CameraTrack, end: int) -> int | None:
     # coding may change the still picture once more before
     at = end + int(np.argmax(steps[end : end + 4]))
     after = steps[at + 1 : at + 7]
-    far = steps[at] >= _LEAST_LEAP and steps[at] > _LEAP * after.max(initial=0.0)
+    far = (
+        len(after) >= 3 and steps[at] >= _LEAST_LEAP and steps[at] > _LEAP * after.max(initial=0.0)
+    )
     return at if far else None
 
 
-def _is_unexplained(
-    track: CameraTrack, motion: Motion, at: int, runs: Sequence[tuple[int, int]]
-) -> bool:
-    """Whether a picture is further from the one before than any other one where the joints are no
-    faster, and that is coded alike.
+def _is_far(track: CameraTrack, leap: int | None) -> bool:
+    """Whether a leap is far larger than the steps that follow it."""
+    steps = _steps(track)
+    return leap is not None and bool(steps[leap] > _FAR * steps[leap + 1 : leap + 7].max())
+
+
+def _is_unexplained(track: CameraTrack, motion: Motion, at: int) -> bool:
+    """Whether a picture is further from the one before than any other one where the joints are
+    hardly faster.
     """
     steps = _steps(track)
     before = np.concatenate([track.t[:1], track.t[:-1]])
@@ -418,22 +357,20 @@ def _is_unexplained(
     way *= track.t - before
     others = np.ones(len(track), bool)
     others[[0, at]] = False
-    others &= way <= 1.5 * way[at] + 1e-3
-    alike = others & (track.keys == track.keys[at])
-    if alike.sum() >= _LEAST_RESTS:
-        others = alike
-    # the stream may have frozen before
-    ends = [steps[e : e + 4].max() for _, e in runs if e < len(track) and not e <= at < e + 4]
-    again = sum(1 for step in ends if step > 0.5 * steps[at])
-    highest = np.sort(steps[others])[: -again or None] if again <= 3 else steps[others]
-    return len(highest) >= _LEAST_RESTS and bool(steps[at] > _LEAP * highest.max())
+    others &= way <= 1.5 * way[at] + _MOVES / 4
+    return int(others.sum()) >= _LEAST_RESTS and bool(steps[at] > _FAR * steps[others].max())
 
 
-def _stops_short(track: CameraTrack, begin: int) -> bool:
-    """Whether what moves in the picture is gone from one picture to the next."""
-    before = track.changes[max(1, begin - 3) : begin + 1]
-    usual = track.changes[max(1, begin - 30) : max(2, begin - 3)]
-    return bool(np.median(before) > 0.6 * np.median(usual)) if len(usual) >= 5 else False
+def _shows_something(track: CameraTrack, begin: int, end: int) -> bool:
+    """Whether a still picture has something in it that is elsewhere at other times."""
+    away = np.abs(track.t - track.t[(begin + end) // 2])
+    away -= (track.t[end - 1] - track.t[begin]) / 2
+    others = track.thumbs[away > _STEP].astype(np.int16)
+    if len(others) < 8:
+        return False
+    here = track.thumbs[(begin + end) // 2]
+    alike = np.abs(others - here).max(axis=(1, 2)).min()
+    return bool(np.abs(np.median(others, axis=0) - here).max() >= _SHOWN and alike >= _SHOWN / 2)
 
 
 # -- late
@@ -446,18 +383,18 @@ def late(track: CameraTrack, found: Lag | None) -> Iterator[Finding | Figure]:
         return
     part = _part(track)
     if found.clear:
-        yield Figure(f"lag of {part}, s", found.lag)
+        yield Figure(f"lag of {part}, s", found.constant)
     if found.drifts:
         text = (
             f"it drifts against the joints: its picture is {_by(found.begin)} at the start and "
             f"{_by(found.end)} at the end"
         )
         drift = abs(found.end - found.begin)
-        yield Finding("camera-late", Use.REVIEW, text, part, value=drift, limit=_DRIFT, unit="s")
-    elif found.clear and not -_LATENCY / 2 <= found.lag <= _LATENCY:
-        text = f"its picture is {_by(found.lag)}, from start to end"
+        yield Finding("camera-late", Use.REVIEW, text, part, value=drift, limit=DRIFT, unit="s")
+    elif found.clear and not -_LATENCY / 2 <= found.constant <= _LATENCY:
+        text = f"its picture is {_by(found.constant)}, from start to end"
         yield Finding(
-            "camera-late", Use.REVIEW, text, part, value=found.lag, limit=_LATENCY, unit="s"
+            "camera-late", Use.REVIEW, text, part, value=found.constant, limit=_LATENCY, unit="s"
         )
 
 
@@ -466,87 +403,6 @@ def _by(lag: float) -> str:
     if abs(lag) < 0.05:
         return "in step with the joints"
     return f"{abs(lag):.2f} s {'behind' if lag > 0 else 'ahead of'} the joints"
-
-
-@dataclass(frozen=True)
-class Lag:
-    """By how much a picture is behind the joints, s, at the start and at the end.
-
-    :param clear: whether the constant lag is certain; ``drifts`` whether its drift is.
-    """
-
-    lag: float
-    begin: float
-    end: float
-    clear: bool
-    drifts: bool
-
-    @classmethod
-    def of(cls, track: CameraTrack, motion: Motion) -> Lag | None:
-        """None where there is too little to tell it by."""
-        if len(track) < 30 or len(motion.t) < 30:
-            return None
-        end = min(float(track.t[-1]), float(motion.t[-1]))
-        if end < _LEAST_LENGTH:
-            return None
-        step = 1 / 30
-        grid = np.arange(0.0, end, step)
-        width = 5  # frames of 30 Hz: joints and picture are smoothed alike
-        middle = (track.t[1:] + track.t[:-1]) / 2
-        seen = _smooth(np.sqrt(np.interp(grid, middle, track.changes[1:]))[:, None], width)[:, 0]
-        speeds = motion.speed
-        signals = [speeds.sum(axis=1), *(s for s in speeds.T if s.any())]
-        best: tuple[float, Floats] | None = None
-        lags = np.arange(-round(_LATEST / step), round(_LATEST / step) + 1)
-        for signal in signals:
-            moved = _smooth(np.sqrt(np.interp(grid, motion.t, signal))[:, None], width)[:, 0]
-            curve = _correlations(seen, moved, lags)
-            if best is None or curve.max() > best[0] + 0.02:
-                best = float(curve.max()), moved
-        assert best is not None
-        return _judge_lag(seen, best[1], lags, step)
-
-
-def _judge_lag(seen: Floats, moved: Floats, lags: NDArray[np.int_], step: float) -> Lag:
-    curve = _correlations(seen, moved, lags)
-    at, clear = _peak(curve, lags, step)
-    half = len(seen) // 2
-    halves = [_correlations(seen[s], moved[s], lags) for s in (slice(half), slice(half, None))]
-    (a, a_clear), (b, b_clear) = (_peak(c, lags, step) for c in halves)
-    slope = (b - a) * 2  # between the middles of the halves lies half of the episode
-    begin, end = (a + b - slope) / 2, (a + b + slope) / 2
-    agree = a_clear and b_clear and abs(b - a) <= 0.12
-    drifts = a_clear and b_clear and abs(slope) > _DRIFT and abs(b - a) > 0.12
-    if drifts:
-        # a picture that is put right by the drift fits clearly better than by one lag
-        times = np.arange(len(seen)) * step
-        put_right = np.interp(times + begin + slope * times / max(times[-1], step), times, seen)
-        better = float(np.corrcoef(put_right, moved)[0, 1])
-        drifts = better > curve.max() + 0.05
-    return Lag(at, begin, end, clear and agree, drifts)
-
-
-def _correlations(seen: Floats, moved: Floats, lags: NDArray[np.int_]) -> Floats:
-    """Correlation of the picture, put earlier by each lag, with the joints; shape (lags,)."""
-    found = np.zeros(len(lags))
-    n = len(seen)
-    for i, lag in enumerate(lags.tolist()):
-        a, b = seen[max(0, lag) : n + min(0, lag)], moved[max(0, -lag) : n - max(0, lag)]
-        if len(a) < n // 2:
-            continue
-        a, b = a - a.mean(), b - b.mean()
-        power = float(a @ a) * float(b @ b)
-        found[i] = float(a @ b) / power**0.5 if power > 0 else 0.0
-    return found
-
-
-def _peak(curve: Floats, lags: NDArray[np.int_], step: float) -> tuple[float, bool]:
-    """The lag of the highest correlation, s, and whether it stands out."""
-    top = int(np.argmax(curve))
-    far = np.abs(lags - lags[top]) * step > 0.4
-    inside = 0 < top < len(curve) - 1
-    clear = curve[top] >= _CLEAR and curve[top] - curve[far].max(initial=-1.0) >= _CLEARER
-    return float(lags[top] * step), bool(clear and inside)
 
 
 # -- of an episode
@@ -563,7 +419,7 @@ def _frozen(episode: Episode) -> Iterator[Finding]:
     motion = motion_of(episode)
     for track, lag in zip(tracks_of(episode), _lags_of(episode), strict=True):
         # what a late picture does not show yet has not frozen
-        late_by = lag.lag if lag is not None and lag.clear else 0.0
+        late_by = np.zeros(len(track)) if lag is None else lag.at(track.t)
         yield from frozen(replace(track, t=track.t - late_by), motion, late_by)
 
 
