@@ -17,6 +17,8 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli import cli
+from dexkit.traces import open_trace, sample_path
+from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.lerobot_in import Dataset
 from dexkit.traces.sessions.lerobot_stats import Aggregate, statistics
 from tests.each import each
@@ -232,7 +234,8 @@ def check_equal(source: Path, copy: Path, kept: Sequence[int]) -> None:
             assert video.read_bytes() == copied.read_bytes()
     info, old_info = (json.loads((r / "meta/info.json").read_text()) for r in (copy, source))
     changed = {k for k in old_info if info[k] != old_info[k]}
-    assert changed <= {"total_episodes", "total_frames", "total_videos", "total_chunks", "splits"}
+    totals = {"total_episodes", "total_frames", "total_videos", "total_chunks"}
+    assert changed <= {*totals, "splits", "dexkit"}
     assert info.keys() == old_info.keys()
     assert (info["total_episodes"], info["total_frames"]) == (len(kept), index)
 
@@ -380,6 +383,36 @@ def test_review_is_dropped_only_if_asked(tmp_path: Path) -> None:
     check_equal(source, tmp_path / "c", [1, 3, 5])
 
 
+def test_frames_are_numbered_in_the_order_of_the_files(tmp_path: Path) -> None:
+    """LeRobot reads all files of v3.0 by name, and finds frames by their place."""
+    files = [[3, 4], [6], [0, 1, 2], [5]]
+    source, out = made(tmp_path / "set", "v3.0", files=files), tmp_path / "out"
+    code, output = dexkit("export", source, out, "--drop", "1,4")
+    assert code == 0, output
+    read = [pq.read_table(path) for path in sorted((out / "data").rglob("*.parquet"))]
+    assert pa.concat_tables(read)["index"].to_pylist() == [*range(sum(LENGTHS) - 9)]
+    for row in pq.read_table(out / "meta/episodes").to_pylist():
+        table = data(out)[row["episode_index"]]
+        ends = table["index"][0].as_py(), table["index"][-1].as_py() + 1
+        assert ends == (row["dataset_from_index"], row["dataset_to_index"])
+
+
+def test_a_set_of_dexkits_export_keeps_its_origins(tmp_path: Path) -> None:
+    """Start, hands and units of each episode."""
+    trace = open_trace(sample_path("dex3_pinch"))
+    paths = [tmp_path / f"s{i}.mcap" for i in range(4)]
+    for i, path in enumerate(paths):
+        begin = trace.first_ns + (5 + i) * 10**9
+        cut(trace, path, spans=[Span(begin, begin + 10**9 // 4)])
+    source = tmp_path / "set"
+    assert dexkit("export", *paths, "--to", "lerobot", "--out", source)[0] == 0
+    code, output = dexkit("export", source, tmp_path / "out", "--drop", "0,2")
+    assert code == 0, output
+    check_equal(source, tmp_path / "out", [1, 3])
+    found = json.loads((tmp_path / "out/meta/info.json").read_text())["dexkit"]["sessions"]
+    assert {k: v["file"] for k, v in found.items()} == {"0": "s1.mcap", "1": "s3.mcap"}
+
+
 def task_folder(root: Path, count: int = 4) -> Path:
     for n in range(count):
         folder = episode(root / f"episode_{n:04d}", streamed(document(frames=4)), 1, 4)
@@ -397,13 +430,14 @@ def tree(root: Path) -> dict[str, bytes | None]:
 
 def test_episodes_of_xr_teleoperate_keep_their_names(tmp_path: Path) -> None:
     source, out = task_folder(tmp_path / "task"), tmp_path / "out"
+    put(source / ".git" / "HEAD", "x")
     found = {"episode_0001": "drop", "episode_0000": "keep"}
     file = verdicts(tmp_path / "e.json", source, found)
     code, output = dexkit("export", source, out, "--drop", file)
     assert code == 0, output
     assert "3 episodes kept, 1 dropped" in output
     assert "gaps in the numbers" in output
-    expected = {k: v for k, v in tree(source).items() if not k.startswith("episode_0001")}
+    expected = {k: v for k, v in tree(source).items() if not k.startswith(("episode_0001", ".git"))}
     assert tree(out) == expected
     assert expected["episode_0002/depths"] is None
 

@@ -16,7 +16,7 @@ from dexkit.staging import whole_folder
 from dexkit.traces.sessions.episodes import DATA, Options
 from dexkit.traces.sessions.lerobot_cleaned import write_cleaned
 from dexkit.traces.sessions.lerobot_in import Dataset, is_dataset
-from dexkit.traces.sessions.plain_files import copy_file, plain_files
+from dexkit.traces.sessions.plain_files import OF_DOWNLOADS, copy_file, plain_files
 from dexkit.traces.sessions.verdicts import EpisodeVerdict
 
 __all__ = ["Cleaned", "Dropped", "by_number", "by_verdict", "export_cleaned", "is_set"]
@@ -215,7 +215,9 @@ def _write(sets: _Sets, choice: Choice, new: Path, result: Cleaned) -> None:
         return
     gone = {place for place, number in choice if number < 0}
     without = {f.relative_to(sets.root).as_posix() for f in (*gone, *sets.datasets)}
-    for name, is_folder in plain_files(sets.root, without):
+    if skipped := sorted(name for name in OF_DOWNLOADS if (sets.root / name).is_dir()):
+        result.notes.append(f"left out, as it is of the original: {', '.join(skipped)}")
+    for name, is_folder in plain_files(sets.root, {*without, *OF_DOWNLOADS}):
         if is_folder:
             (new / name).mkdir(exist_ok=True)
         else:

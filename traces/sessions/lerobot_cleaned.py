@@ -31,7 +31,7 @@ from dexkit.traces.sessions.lerobot_format import (
 from dexkit.traces.sessions.lerobot_in import Dataset, as_numbers, read_metadata
 from dexkit.traces.sessions.lerobot_stats import Aggregate, statistics
 from dexkit.traces.sessions.paths import below
-from dexkit.traces.sessions.plain_files import copy_file, plain_files
+from dexkit.traces.sessions.plain_files import OF_DOWNLOADS, copy_file, plain_files
 from dexkit.traces.sessions.typed import parse_record
 
 __all__ = ["Remarks", "write_cleaned"]
@@ -41,8 +41,6 @@ _VALUES_AT_ONCE = 4 << 20  # of columns whose statistics are calculated
 _ROW_GROUP = 256 << 20  # bytes of the rows of an episode that are written at once
 _OWN = ("data", "videos", "meta/episodes")
 """Folders of which only what an episode names is written."""
-_OF_DOWNLOADS = frozenset({".cache", ".git"})
-"""What Hugging Face and Git know of the files that were downloaded: not of those written here."""
 _SPLIT = re.compile(r"(\d{1,9}):(\d{1,9})", re.ASCII)
 _NAMED = 5  # files that a remark names
 
@@ -129,7 +127,7 @@ class _Cleaner:
         named = self._named()
         found: list[str] = []
         stray: list[str] = []
-        for path, folder in plain_files(self._root, _OF_DOWNLOADS):
+        for path, folder in plain_files(self._root, OF_DOWNLOADS):
             if not (folder or path in named or _is_rewritten(path)):
                 own = any(path.startswith(f"{place}/") for place in _OWN)
                 (stray if own else found).append(path)
@@ -143,7 +141,7 @@ class _Cleaner:
             )
         if stray:
             self._remarks.problems.append(f"left out, as no episode names it: {_few(stray)}")
-        if skipped := [name for name in sorted(_OF_DOWNLOADS) if (self._root / name).is_dir()]:
+        if skipped := [name for name in sorted(OF_DOWNLOADS) if (self._root / name).is_dir()]:
             self._remarks.notes.append(f"left out, as it is of the original: {_few(skipped)}")
         return found
 

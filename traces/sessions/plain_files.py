@@ -11,7 +11,10 @@ from dexkit.documents import open_ordinary
 from dexkit.errors import SessionError
 from dexkit.escaping import one_line
 
-__all__ = ["copy_file", "plain_files"]
+__all__ = ["OF_DOWNLOADS", "copy_file", "plain_files"]
+
+OF_DOWNLOADS = frozenset({".cache", ".git"})
+"""What Hugging Face and Git know of the files that were downloaded: not of those of a copy."""
 
 _PIECE = 1 << 20
 
