@@ -323,7 +323,7 @@ class Audit:
         judged: dict[str, dict[str, Judgement]] = {}
         for record in journal.records(names):
             if record.judgement is not None:
-                light = structs.replace(record.judgement, curves=[])
+                light = structs.replace(record.judgement, curves=[], shots=[])
                 judged.setdefault(record.source, {})[record.name] = light
         found: dict[str, list[TrainingFinding]] = {}
         for source, judgements in judged.items():

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexkit.conformance.audit.records import EpisodeRecord, State
-from dexkit.conformance.dataset.findings import Curve, Finding, Use
+from dexkit.conformance.dataset.findings import Curve, Finding, Shot, Use
 from dexkit.conformance.dataset.judge import CHECKS, TITLES
 from dexkit.conformance.report.charts import Band, Chart, Line
 from dexkit.hand import Floats
@@ -33,7 +33,7 @@ class Card:
 
     :param css: class that colours it.
     :param reasons: place in time, text; ``more`` are not shown.
-    :param charts: pictures of the moments; caption and chart.
+    :param curves: of the moments, with their findings; ``shots`` are what a camera saw then.
     """
 
     name: str
@@ -44,6 +44,7 @@ class Card:
     reasons: tuple[tuple[str, str], ...]
     more: int
     curves: tuple[tuple[Finding, Curve], ...]
+    shots: tuple[Shot, ...] = ()
 
     @property
     def charts(self) -> Iterator[Chart]:
@@ -140,9 +141,10 @@ class TrainingSummary:
             judgement.use,
             _WORDS[judgement.use],
             length,
-            tuple((_place(f), f.text) for f in reasons[:_REASONS]),
+            tuple((_place(f), _text(f)) for f in reasons[:_REASONS]),
             max(0, len(reasons) - _REASONS),
             tuple((judgement.findings[c.finding], c) for c in judgement.curves),
+            tuple(judgement.shots),
         )
         drops = sum(f.use is Use.DROP for f in reasons)
         # the heap's smallest is the least bad, and of equals the last one
@@ -195,6 +197,12 @@ class TrainingSummary:
 
 def _most(figures: Mapping[str, _Values]) -> int:
     return max((len(v.values) for v in figures.values()), default=0)
+
+
+def _text(finding: Finding) -> str:
+    """What is wrong; of a camera, with which one."""
+    is_camera = finding.part.startswith("camera ")
+    return f"{finding.part}: {finding.text}" if is_camera else finding.text
 
 
 def _place(finding: Finding) -> str:

@@ -14,8 +14,8 @@ from dexkit.conformance.dataset.whole_set import WholeSet
 __all__ = ["OF_SETS", "across"]
 
 OF_SETS = {
-    "duplicate": "Every episode once",
-    "statistics": "Statistics of the metadata are those of the data",
+    "duplicate": "Copies of another episode",
+    "statistics": "Statistics that are not those of the data",
 }
 """Names and titles of what is found here."""
 

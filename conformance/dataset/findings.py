@@ -7,7 +7,7 @@ from enum import Enum
 
 import msgspec
 
-__all__ = ["Curve", "Finding", "Judgement", "Use", "use_of"]
+__all__ = ["Curve", "Finding", "Judgement", "Shot", "Use", "use_of"]
 
 
 class Use(str, Enum):
@@ -63,6 +63,20 @@ class Curve(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     action: list[float | None] = []
 
 
+class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a camera saw at the moment of a finding.
+
+    :param finding: index of the finding.
+    :param seconds: after the start of the episode.
+    :param jpeg: the picture, small, in base64.
+    """
+
+    finding: int
+    camera: str
+    seconds: float
+    jpeg: str
+
+
 class Judgement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     """The verdict on an episode.
 
@@ -76,6 +90,7 @@ class Judgement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     use: Use = Use.KEEP
     findings: list[Finding] = []
     curves: list[Curve] = []
+    shots: list[Shot] = []
     figures: dict[str, float] = {}
     judged: list[str] = []
     key: str = ""

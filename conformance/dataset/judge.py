@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.dataset.across import OF_SETS
-from dexkit.conformance.dataset.cameras import decoders
+from dexkit.conformance.dataset.cameras import decoders, picture
 from dexkit.conformance.dataset.check import Check, Figure, data_of
 from dexkit.conformance.dataset.checks import (
     assignment,
@@ -23,7 +24,7 @@ from dexkit.conformance.dataset.checks import (
     units,
 )
 from dexkit.conformance.dataset.episode import Episode, Track
-from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, use_of
+from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, Shot, use_of
 from dexkit.conformance.dataset.likeness import shape_of
 from dexkit.conformance.dataset.motion import span
 from dexkit.hand import Floats
@@ -85,9 +86,10 @@ def judge(episode: Episode) -> Judgement:
             else:
                 findings.append(found)
     findings = _causes(findings)
-    result = Judgement(use_of(findings), findings, [], figures, judged)
+    result = Judgement(use_of(findings), findings, figures=figures, judged=judged)
     reasons = [findings.index(f) for f in result.reasons[:_CURVES]]
     result.curves = [c for i in reasons if (c := _curve(episode, i, findings[i])) is not None]
+    result.shots = [s for i in reasons[:1] if (s := _shot(episode, i, findings[i])) is not None]
     result.key, result.shape = _key(episode), shape_of(episode)
     result.kind = _kind(episode)
     return result
@@ -119,6 +121,23 @@ def _curve(episode: Episode, number: int, finding: Finding) -> Curve | None:
         _thin(track.state, chosen, joint),
         _thin(track.action, chosen, joint),
     )
+
+
+def _shot(episode: Episode, number: int, finding: Finding) -> Shot | None:
+    """What a camera saw in the middle of a finding: the finding's camera, or the first."""
+    if finding.begin_s is None:
+        return None
+    colours = [c.name for c in episode.cameras if c.group == "colors"]
+    named = finding.part.removeprefix("camera ")
+    camera = named if named in colours else next(iter(colours), None)
+    if camera is None:
+        return None
+    end = finding.begin_s if finding.end_s is None else finding.end_s
+    seconds = (finding.begin_s + end) / 2
+    data = picture(episode, camera, seconds)
+    if data is None:
+        return None
+    return Shot(number, camera, round(seconds, 2), base64.b64encode(data).decode())
 
 
 def _joint_to_show(track: Track, finding: Finding, frames: Frames) -> int:

@@ -109,4 +109,4 @@ def _holds(state: Floats, action: Floats) -> bool:
     return bool((np.abs(np.median(action - state, axis=0)) > _HOLDS).any())
 
 
-CHECKS = (Check("idle", "Idle time at the begin and the end", frozenset(), _idle),)
+CHECKS = (Check("idle", "Long idle time at the start or the end", frozenset(), _idle),)

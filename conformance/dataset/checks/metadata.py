@@ -134,7 +134,12 @@ def _readable(episode: Episode) -> Iterator[Finding]:
 
 
 CHECKS = (
-    Check("task", "A task text", frozenset({Data.TASK}), _task),
-    Check("statistics", "Statistics of the data", frozenset({Data.STATISTICS}), _statistics),
-    Check("readable", "Data that can be read", frozenset(), _readable),
+    Check("task", "No task text", frozenset({Data.TASK}), _task),
+    Check(
+        "statistics",
+        "Statistics that are not those of the data",
+        frozenset({Data.STATISTICS}),
+        _statistics,
+    ),
+    Check("readable", "Data that cannot be read", frozenset(), _readable),
 )

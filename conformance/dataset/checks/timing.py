@@ -454,5 +454,5 @@ CHECKS = (
         frozenset({Data.STATE, Data.ACTION}),
         _out_of_step,
     ),
-    Check("fps", "True time against the stated rate", frozenset({Data.STATE}), _fps),
+    Check("fps", "A stated rate that is not the true one", frozenset({Data.STATE}), _fps),
 )
