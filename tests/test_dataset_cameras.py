@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,12 @@ import pytest
 from numpy.typing import NDArray
 
 from dexkit.conformance.dataset import cameras as decoding
+from dexkit.conformance.dataset.camera_sets import never_moving
 from dexkit.conformance.dataset.cameras import CameraTrack, not_judged, picture, tracks_of
 from dexkit.conformance.dataset.checks.cameras import camera_findings
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Finding, Use
+from dexkit.conformance.dataset.judge import judge
 from dexkit.conformance.dataset.read import episode_of_dataset, episode_of_session
 from dexkit.hand import Floats
 from dexkit.traces.sessions.episodes import read_episode
@@ -395,6 +397,29 @@ def test_a_frozen_stretch_is_found(
     assert (found.check, found.use, found.part) == ("camera-frozen", Use.DROP, "camera v")
     assert found.begin_s == pytest.approx(stretch[0], abs=1.0)
     assert found.end_s == pytest.approx(stretch[1], abs=0.5)
+
+
+def test_a_camera_that_never_moves_is_found_beside_other_episodes(tmp_path: Path) -> None:
+    q = reaches(8, FPS)
+    pictures = scene(q)
+    write_video(tmp_path / "v.mp4", pictures)
+    write_video(tmp_path / "w.mp4", still(pictures))
+    judged = {}
+    for i in range(7):
+        episode = episode_with(tmp_path, q + 0.1 * i, videos=("w.mp4" if i == 3 else "v.mp4",))
+        episode.cameras = [replace(c, name="head") for c in episode.cameras]
+        judged[str(i)] = judge(episode)
+    found = {n: [f.check for f in each] for n, each in dict_of(never_moving(judged)).items()}
+    assert found == {"3": ["camera-frozen"]}
+    blind = dict.fromkeys(judged, judged["3"])
+    assert not list(never_moving(blind))
+
+
+def dict_of(found: Iterable[tuple[str, Finding]]) -> dict[str, list[Finding]]:
+    by_name: dict[str, list[Finding]] = {}
+    for name, finding in found:
+        by_name.setdefault(name, []).append(finding)
+    return by_name
 
 
 # -- late

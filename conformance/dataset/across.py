@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from dexkit.conformance.dataset.camera_sets import never_moving
 from dexkit.conformance.dataset.findings import Finding, Judgement, Use
 from dexkit.conformance.dataset.likeness import alike
 from dexkit.conformance.dataset.whole_set import WholeSet
@@ -40,7 +41,7 @@ def across(
     for name, judgement in judgements.items():
         kinds.setdefault(judgement.kind, {})[name] = judgement
     for kind in kinds.values():
-        for name, finding in (*_duplicates(kind), *_late(kind)):
+        for name, finding in (*_duplicates(kind), *_late(kind), *never_moving(kind)):
             found.setdefault(name, []).append(finding)
     return found
 

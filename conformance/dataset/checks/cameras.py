@@ -47,6 +47,7 @@ _MOVES = 0.02  # strokes, all joints together, in a window in which something mo
 _LEAST_MOTION = 0.15  # strokes within a frozen stretch; less may be out of sight
 _ANSWERS = 0.7  # share of comparable windows elsewhere in which the picture answers
 _STRAY = 0.1  # share of a frozen stretch's windows in which coding looks like an answer
+_LEAST_WINDOWS = 16  # with motion: 2 s
 _SHOWN = 15  # levels by which a block differs where something is in it
 _LEAST_COMPARABLE = 6  # of such windows: 1.5 s
 _LEAST_SEEN = 4  # windows of a stretch, each with such company elsewhere
@@ -289,17 +290,22 @@ def _noise_stops(track: CameraTrack, motion: Motion, begin: int, end: int) -> bo
     return bool(np.mean(track.altered[1 : len(alive) + 1][rests] > _NOISE) > _LEAST_ALIVE)
 
 
+def _windows(track: CameraTrack, motion: Motion) -> tuple[Floats, Floats, Mask]:
+    """Begins of short windows, s, how far each part gets in them, shape (windows, parts), and
+    whether the picture answers.
+    """
+    at: Floats = np.arange(0.0, float(motion.t[-1]) - _STEP, _STEP / 2, dtype=np.float64)
+    moved = motion.travel(at, at + _STEP)
+    a, b = (np.clip(np.searchsorted(track.t, x), 0, len(track) - 1) for x in (at, at + _STEP))
+    difference = np.abs(track.thumbs[b].astype(np.int16) - track.thumbs[a])
+    return at, moved, difference.max(axis=(1, 2)) >= _ANSWER
+
+
 def _would_answer(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool:
     """Whether the picture answers elsewhere to less motion of the same parts than here."""
     first, last = float(track.t[begin]), float(track.t[end - 1])
-    at: Floats = np.arange(0.0, float(motion.t[-1]) - _STEP, _STEP / 2, dtype=np.float64)
-    if not len(at):
-        return False
-    moved = motion.travel(at, at + _STEP)
+    at, moved, answers = _windows(track, motion)
     total = moved.sum(axis=1)
-    a, b = (np.clip(np.searchsorted(track.t, x), 0, len(track) - 1) for x in (at, at + _STEP))
-    difference = np.abs(track.thumbs[b].astype(np.int16) - track.thumbs[a]).reshape(len(at), -1)
-    answers = difference.max(axis=1) >= _ANSWER
     here = (at >= first) & (at + _STEP <= last) & (total > _MOVES)
     outside = ((at + _STEP < first) | (at > last)) & (total > _MOVES)
     if not here.any() or answers[here].mean() > _STRAY:
@@ -415,12 +421,26 @@ def _missing(episode: Episode) -> Iterator[Finding]:
     yield from _merged(found, len(tracks))
 
 
-def _frozen(episode: Episode) -> Iterator[Finding]:
+def _seen(track: CameraTrack, motion: Motion) -> Iterator[Figure]:
+    """In how much of the motion the picture moves; only where all arms move."""
+    if len(track) < 4 or len(motion.t) < 4:
+        return
+    _, moved, answers = _windows(track, motion)
+    arms = [i for i, name in enumerate(motion.parts) if name.endswith("arm")]
+    ways = moved[:, arms].sum(axis=0) if arms else moved.sum(axis=0)
+    moving = moved.sum(axis=1) > _MOVES
+    if moving.sum() >= _LEAST_WINDOWS and ways.min(initial=np.inf) >= _LEAST_MOTION:
+        share = 100 * float(answers[moving].mean())
+        yield Figure(f"motion seen by {_part(track)}, %", round(share, 1))
+
+
+def _frozen(episode: Episode) -> Iterator[Finding | Figure]:
     motion = motion_of(episode)
     for track, lag in zip(tracks_of(episode), _lags_of(episode), strict=True):
         # what a late picture does not show yet has not frozen
         late_by = np.zeros(len(track)) if lag is None else lag.at(track.t)
         yield from frozen(replace(track, t=track.t - late_by), motion, late_by)
+        yield from _seen(track, motion)
 
 
 @lru_cache(maxsize=1)
