@@ -536,7 +536,7 @@ def test_what_cannot_be_dropped_is_refused_and_nothing_is_written(tmp_path: Path
         ((source, out, "--drop", "1", "--set", "drop=review"), "file of verdicts"),
         ((source, out, "--drop", good, "--to", "lerobot"), "own format"),
         ((source, out, "--drop", good, "--set", "fps=3"), "own format"),
-        ((source, out), f"dexkit export {source} OUT --drop episodes.json"),
+        ((source, out), f"dexkit export {source} --out DIR --drop episodes.json"),
         ((source, "--to", "lerobot", "--out", out), "--drop episodes.json"),
         ((xr, "--to", "episodes"), "--drop episodes.json"),
         ((tmp_path / "e.mcap", "--to", "lerobot"), "--out is missing"),

@@ -166,8 +166,8 @@ def _usage(source: Path) -> str:
 
     if is_set(source):
         return (
-            f"dexkit export {source} OUT --drop episodes.json writes it without the episodes that "
-            "dexkit audit would drop; dexkit import makes recordings of it, for --to"
+            f"dexkit export {source} --out DIR --drop episodes.json writes it without the "
+            "episodes that dexkit audit would drop; dexkit import makes recordings of it, for --to"
         )
     return f"dexkit export SESSION.mcap --to {'|'.join(_FORMATS)} --out DIR"
 
