@@ -17,7 +17,7 @@ from tests.dataset_episodes import changed, episode
 
 @pytest.fixture(scope="module")
 def takes() -> dict[str, Judgement]:
-    return {f"take {i}": judge(episode(100 + i, arms=False, seconds=10)) for i in range(9)}
+    return {f"take {i}": judge(episode(100 + i, hands=["left_hand"], seconds=10)) for i in range(9)}
 
 
 def _cut(source: Episode, begin: int, end: int, noise: float) -> Episode:
@@ -55,7 +55,7 @@ def test_takes_of_one_task(takes: dict[str, Judgement]) -> None:
 def test_duplicate(
     takes: dict[str, Judgement], begin: int, end: int, noise: float, use: Use
 ) -> None:
-    copy = judge(_cut(episode(103, arms=False, seconds=10), begin, end, noise))
+    copy = judge(_cut(episode(103, hands=["left_hand"], seconds=10), begin, end, noise))
     found = across({**takes, "copy": copy})
     assert list(found) == ["copy"]
     [finding] = found["copy"]
@@ -69,18 +69,21 @@ def test_the_better_one_stays(takes: dict[str, Judgement]) -> None:
         values[200, 0] += 0.7
         return values
 
-    bad = judge(changed(episode(103, arms=False, seconds=10), "left_hand", state=spike))
+    bad = judge(changed(episode(103, hands=["left_hand"], seconds=10), "left_hand", state=spike))
     assert bad.use is not Use.KEEP
     assert list(across({"bad": bad, **takes})) == ["bad"]
 
 
-def test_later_than_the_others(takes: dict[str, Judgement]) -> None:
-    index = np.clip(np.arange(300) - 7, 0, 299)
-    late = changed(
-        episode(120, arms=False, seconds=10), "left_hand", state=lambda values: values[index]
-    )
+@pytest.mark.parametrize(("frames", "part"), [(5, ""), (11, "left_hand"), (6, None)])
+def test_later_than_the_others(takes: dict[str, Judgement], frames: int, part: str | None) -> None:
+    index = np.clip(np.arange(300) - frames, 0, 299)
+    source = episode(120, hands=["left_hand"], seconds=10)
+    late = changed(source, part or ("left_hand" if part is None else ""), state=lambda v: v[index])
     found = across({**takes, "late": judge(late)})
+    if part is None:
+        assert not found  # a slow hand
+        return
     assert list(found) == ["late"]
     [finding] = found["late"]
     assert finding.check == "out-of-step"
-    assert finding.part == "left_hand"
+    assert finding.part == part

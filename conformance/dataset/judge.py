@@ -96,7 +96,11 @@ def judge(episode: Episode) -> Judgement:
 
 
 def _causes(findings: list[Finding]) -> list[Finding]:
-    """Without what follows from another finding: in another unit, all is too quick."""
+    """Without what follows from another finding: in another unit, all is too quick; and a few
+    joints that leap by a turn are no other unit.
+    """
+    leaps = {f.part for f in findings if f.check == "jump" and f.joints}
+    findings = [f for f in findings if f.check != "units" or f.part not in leaps]
     units = {f.part for f in findings if f.check == "units"}
     return [f for f in findings if not (f.check in _BY_UNITS and f.part in units)]
 

@@ -72,20 +72,21 @@ def _still(episode: Episode) -> tuple[int, int]:
             limit = np.maximum(_STILL, np.maximum(_NOISES * series.noise, 2.5 * series.quantum))
             if series is state and (2.5 * series.quantum > _STILL).any():
                 limit = np.minimum(limit, 0.06)  # two steps of the coarsest encoders
-            for values, flip in ((series.q, False), (series.q[::-1], True)):
-                first = np.median(values[: smooth + 1], axis=0)
-                left = np.abs(values - first) > limit
-                at = int(np.argmax(left.any(axis=1))) if left.any() else count
-                if flip:
-                    end = max(end, count - 1 - at) if left.any() else end
-                else:
-                    begin = min(begin, at)
+            # only what other parts leave still is looked at
+            first = np.median(series.q[: smooth + 1], axis=0)
+            moved = (np.abs(series.q[:begin] - first) > limit).any(axis=1)
+            begin = int(np.argmax(moved)) if moved.any() else begin
+            last = np.median(series.q[-smooth - 1 :], axis=0)
+            moved = (np.abs(series.q[:end:-1] - last) > limit).any(axis=1)
+            end = count - 1 - int(np.argmax(moved)) if moved.any() else end
+    if begin >= count:
+        return count, count
+    for track in episode.hands:
+        state, action = series_of(track, "state"), series_of(track, "action")
         # a hand that presses on an object is at work, though nothing moves
-        if state is None or action is None or not track.is_hand or end >= count - 1:
-            continue
-        if _holds(state.q[end:], action.q[end:]):
-            end = count - 1
-    return (begin, end) if begin < count else (count, count)
+        if state is not None and action is not None and _holds(state.q[end:], action.q[end:]):
+            return begin, count - 1
+    return begin, end
 
 
 def _longest_pause(episode: Episode, begin: int, end: int) -> float:

@@ -123,7 +123,7 @@ def _leaps(
     if not big.any():
         return spikes, stays
     given = _given(episode, action, size.shape)
-    unexplained = big & (given < _EXPLAINS * size)
+    unexplained = big & ((given < _EXPLAINS * size) | _leaves(episode, state, action, size))
     # out and back: the values before and after it agree
     for width in (1, 2, 3):
         if n <= width + 2:
@@ -193,6 +193,28 @@ def _given(episode: Episode, action: Series | None, shape: tuple[int, ...]) -> F
         found[step:] = np.maximum(found[step:], found[:-step].copy())
         width += step
     found[:-1] = np.maximum(found[:-1], size[1:])  # and in the next frame: the next state
+    return found
+
+
+def _leaves(episode: Episode, state: Series, action: Series | None, size: Floats) -> Bools:
+    """Whether a state leaps away from wherever its action has been for as long as it may be late:
+    no step of the action asks for this.
+    """
+    found = np.zeros(size.shape, dtype=np.bool_)
+    if action is None or action.q.shape != size.shape:
+        return found
+    late = frames_of(episode, _LATE_S)
+    low, high = action.q.copy(), action.q.copy()
+    width = 1
+    while width < late:
+        step = min(width, late - width)
+        low[step:] = np.minimum(low[step:], low[:-step].copy())
+        high[step:] = np.maximum(high[step:], high[:-step].copy())
+        width += step
+    low[:-1] = np.minimum(low[:-1], action.q[1:])
+    high[:-1] = np.maximum(high[:-1], action.q[1:])
+    outside = np.maximum(np.maximum(low - state.q, state.q - high), 0)
+    found[1:] = outside[1:] - outside[:-1] > 0.7 * size[1:]
     return found
 
 

@@ -29,7 +29,9 @@ _SURE = 0.7  # correlation from which a delay is believed
 _FIRM = 0.8  # from which it is a reason: the other hand's action may be like it by 0.78
 _SHARP = 0.9  # and from which it is compared with that of other episodes
 _LATEST_HAND_S = 0.7  # Inspire's hands on a G1 are 0.4 s behind, with values up to 0.13 s old
-_LATEST_ARM_S = 0.45
+_LATEST_QUICK_S = 0.5  # hands with 200 states a second: 0.15 s, slow ones 0.3 s
+_QUICK_HZ = 150.0
+_LATEST_ARM_S = 0.4  # arms that swing are 0.2 s behind
 _EARLY_FRAMES = 2.5  # that a state may be before its action: the next state is the action
 _APART_HANDS_S = 0.4  # that one of two equal hands may be later than the other
 _APART_ARMS_S = 0.25
@@ -169,8 +171,8 @@ def _out_of_step(episode: Episode) -> Iterator[Finding | Figure]:
         speeds = _speeds(episode, track)
         if speeds is None:
             continue
-        drift = _drift(episode, track, speeds)
         lag = lag_of(speeds.state, speeds.action, episode.fps)
+        drift = _drift(episode, track, speeds) if _may_drift(speeds, lag, episode.fps) else None
         if drift is not None:
             found.append(drift)
         elif lag is not None and lag.correlation >= _SURE:
@@ -237,6 +239,8 @@ def _absolute(episode: Episode, track: Track, lag: Lag) -> _Step | None:
         limit = -_EARLY_FRAMES / episode.fps
         return _Step("early", track, lag.peak_s, limit, lag.correlation)
     latest = _LATEST_HAND_S if track.is_hand else _LATEST_ARM_S
+    if track.model is not None and track.model.min_state_rate > _QUICK_HZ:
+        latest = _LATEST_QUICK_S
     if lag.seconds > latest:
         return _Step("late", track, lag.seconds, latest, lag.correlation)
     return None
@@ -296,6 +300,23 @@ def _drift(episode: Episode, track: Track, speeds: _Speeds) -> _Step | None:
     if growing < _FIRM or growing - steady < _BETTER:
         return None
     return _Step("drift", track, drift, limit, growing, (found[0].peak_s, found[2].peak_s))
+
+
+def _may_drift(speeds: _Speeds, lag: Lag | None, fps: float) -> bool:
+    """Whether what a constant lag leaves over goes with time and the change of the action, as a
+    small drift makes it; a large one leaves little correlation. Cheaper than to look for it.
+    """
+    if lag is None or lag.correlation < 0.93:
+        return True
+    late = round(lag.peak_s * fps)
+    n = len(speeds.state) - abs(late)
+    state, action = speeds.state[max(late, 0) :][:n], speeds.action[max(-late, 0) :][:n]
+    changes = np.zeros_like(action)
+    changes[1:-1] = 0.5 * (action[2:] - action[:-2])
+    changes *= np.linspace(-0.5, 0.5, n)[:, None]
+    power = float((changes**2).sum())
+    drift = -float(((state - action) * changes).sum()) / power if power > 0 else 0.0
+    return abs(drift) > 0.6 * max(_DRIFT_FRAMES, _DRIFT_S * fps)
 
 
 def _match(speeds: _Speeds, late: Floats) -> float:
