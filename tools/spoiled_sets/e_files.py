@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dexkit.traces import sample_path
 from dexkit.traces.reader import Trace, open_trace
 from dexkit.traces.sessions.edit import Span, cut
+from dexkit.traces.sessions.lerobot_out import TASKS_METADATA
 from dexkit.traces.sessions.lerobot_stats import statistics
 from dexkit.traces.writer import RecordingWriter
 from tools.spoiled_sets.e_faults import ALL, Fault
@@ -301,10 +302,9 @@ def write_lerobot(root: Path, made: Set, takes: Sequence[Take]) -> None:
         parquet.write_table(
             arrow.Table.from_pylist(rows), str(root / "meta/episodes/chunk-000/file-000.parquet")
         )
-        parquet.write_table(
-            arrow.table({"task_index": list(tasks.values()), "task": list(tasks)}),
-            str(root / "meta/tasks.parquet"),
-        )
+        listed = arrow.table({"task_index": list(tasks.values()), "task": list(tasks)})
+        listed = listed.replace_schema_metadata(TASKS_METADATA)
+        parquet.write_table(listed, str(root / "meta/tasks.parquet"))
         info |= {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
                  "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
                  "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-"

@@ -37,7 +37,7 @@ from dexkit.traces.sessions.lerobot_stats import Aggregate, statistics
 from dexkit.traces.sessions.pictures import parse_picture
 from dexkit.traces.sessions.streams import COMMAND, STATE
 
-__all__ = ["Result", "describe", "export_dataset"]
+__all__ = ["TASKS_METADATA", "Result", "describe", "export_dataset"]
 
 _CHUNK = 1000  # files in a folder
 _FILE_MB = 100
@@ -280,7 +280,7 @@ class _Writer:
         tasks = arrow.table(
             {"task_index": arrow.array(range(len(self._tasks))), "task": list(self._tasks)}
         )
-        tasks = tasks.replace_schema_metadata({"pandas": json.dumps(_PANDAS)})
+        tasks = tasks.replace_schema_metadata(TASKS_METADATA)
         self._parquet.write_table(tasks, str(meta / "tasks.parquet"))
         stats = {k: statistics(np.concatenate(v)) for k, v in self._all.items()}
         stats |= {k: v.statistics() for k, v in self._picture_stats.items()}
@@ -359,6 +359,8 @@ _PANDAS = {
     "creator": {"library": "dexkit", "version": __version__},
     "pandas_version": "2.0.0",
 }
+TASKS_METADATA = {"pandas": json.dumps(_PANDAS)}
+"""Of the schema of ``meta/tasks.parquet``: LeRobot finds tasks by pandas' index."""
 
 
 def _huggingface(name: str, kind: Any) -> dict[str, Any]:
