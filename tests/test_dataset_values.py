@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
-from dexkit.conformance.dataset.episode import Episode
+from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.judge import judge
 from dexkit.hand import Floats
@@ -20,6 +21,7 @@ HANDS = ("dex1-1", "dex3-1", "dex5-1", "brainco-revo2", "inspire-dfx")
 NOISE = 0.002
 
 
+@cache
 def made(hand: str = "dex3-1", seed: int = 1, **more: Any) -> Episode:
     """Two hands and two arms, whose joints move each for itself."""
     options = {"kind": "apart", "plant": Plant(noise=NOISE), "arm_kind": "apart", **more}
@@ -308,3 +310,77 @@ def test_an_episode_without_actions_is_found() -> None:
     assert "no action" in only(bare, "readable").text
     bare = replace(base, tracks=[replace(t, state=None) for t in base.tracks])
     assert "no observation" in only(bare, "readable").text
+
+
+# -- clipped actions, grasps -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("part", ["left_hand", "left_arm"])
+def test_actions_that_are_cut_off_are_found(part: str) -> None:
+    def cut(action: Floats) -> Floats:
+        low, high = action.min(axis=0), action.max(axis=0)
+        return np.clip(action, low + 0.35 * (high - low), high)
+
+    fault = only(changed(made(), part, action=cut), "clipped")
+    assert fault.part == part
+    assert fault.use is Use.DROP
+
+
+def losing(track: Track, at: int) -> Track:
+    """A hand whose object is gone from a frame on."""
+    assert track.state is not None
+    assert track.action is not None
+    way = np.clip((np.arange(len(track.state)) - at) / 8, 0, 1)[:, None]
+    noise = np.random.default_rng(5).normal(0, NOISE, track.state.shape)
+    return replace(track, state=track.state + way * (track.action - track.state) + noise)
+
+
+def holding(hand: str) -> tuple[Episode, int]:
+    """A hand that closes, holds an object from 2 to 9 s, and opens; and a frame in between."""
+    base = made(hand, arms=False, hands=("left_hand",))
+    t = base.t
+    told = np.interp(t, [1, 2, 9, 10], [0.05, 0.9, 0.9, 0.05])[:, None]
+    track = base.tracks[0]
+    assert track.limits is not None
+    assert track.closing is not None
+    low, high = track.limits
+    start, end = np.where(track.closing < 0, high, low), np.where(track.closing < 0, low, high)
+    noise = np.random.default_rng(1).normal(0, NOISE, (len(t), len(low)))
+    late = np.concatenate((told[:2], told[:-2]))
+    track = replace(
+        track,
+        action=start + told * (end - start),
+        state=start + np.minimum(late, 0.5) * (end - start) + noise,
+    )
+    return replace(base, tracks=[track]), round(5.5 * FPS)
+
+
+@pytest.mark.parametrize("hand", HANDS)
+def test_an_object_that_is_lost_is_found(hand: str) -> None:
+    good, at = holding(hand)
+    assert blamed(good) == []
+    fault = only(replace(good, tracks=[losing(good.tracks[0], at)]), "grasp")
+    assert fault.part == "left_hand"
+    assert fault.begin_s is not None
+    assert fault.end_s is not None
+    assert fault.begin_s <= at / FPS + 0.3 <= fault.end_s + 0.4
+    figures = judge(good).figures
+    assert figures["left hand holds, s"] > 5
+    assert figures["left hand closings"] == 1
+
+
+@pytest.mark.parametrize("field", ["touch", "tau"])
+def test_pressure_that_falls_in_a_closed_hand_is_found(field: str) -> None:
+    good, at = holding("dex3-1")
+    n = len(good)
+    press = ((good.t > 2) & (good.t < 9))[:, None] * np.ones((1, 7))
+    size, level = (2000.0, 100_000.0) if field == "touch" else (0.5, 0.0)
+    noise = np.random.default_rng(4).normal(0, 0.02 * size, (n, 7))
+    values = level + size * press + noise
+
+    def with_field(v: Floats) -> Episode:
+        return replace(good, tracks=[replace(good.tracks[0], **{field: v})])  # type: ignore[arg-type]
+
+    assert blamed(with_field(values)) == []
+    gone = np.where(np.arange(n)[:, None] > at, level + noise, values)
+    assert only(with_field(gone), "grasp").part == "left_hand"

@@ -10,6 +10,11 @@ import numpy as np
 from dexkit.conformance.dataset.camera_sets import never_moving
 from dexkit.conformance.dataset.findings import Finding, Judgement, Use
 from dexkit.conformance.dataset.likeness import alike
+from dexkit.conformance.dataset.set_values import (
+    grasps_of_set,
+    statistics_of_set,
+    units_of_set,
+)
 from dexkit.conformance.dataset.whole_set import WholeSet
 
 __all__ = ["OF_SETS", "across"]
@@ -43,8 +48,17 @@ def across(
     for name, judgement in judgements.items():
         kinds.setdefault(judgement.kind, {})[name] = judgement
     for kind in kinds.values():
-        for name, finding in (*_duplicates(kind), *_late(kind), *never_moving(kind)):
+        for name, finding in (
+            *_duplicates(kind),
+            *_late(kind),
+            *never_moving(kind),
+            *grasps_of_set(kind),
+            *units_of_set(kind),
+        ):
             found.setdefault(name, []).append(finding)
+    if whole is not None:
+        for finding in statistics_of_set(judgements, whole):
+            found.setdefault(whole.name, []).append(finding)
     return found
 
 

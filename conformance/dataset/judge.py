@@ -14,9 +14,11 @@ from dexkit.conformance.dataset.check import Check, Figure, data_of
 from dexkit.conformance.dataset.checks import (
     assignment,
     cameras,
+    clipped,
     following,
     frames,
     frozen,
+    grasps,
     idle,
     jumps,
     metadata,
@@ -41,7 +43,9 @@ CHECKS: tuple[Check, ...] = (
     *cameras.CHECKS,
     *units.CHECKS,
     *assignment.CHECKS,
+    *clipped.CHECKS,
     *following.CHECKS,
+    *grasps.CHECKS,
 )
 """Every check of a single episode."""
 TITLES = {check.name: check.title for check in CHECKS} | OF_SETS
@@ -51,13 +55,13 @@ VERSION = 1
 
 Frames = NDArray[np.intp]
 
-_BY_UNITS = (
-    "jump",
-    "fps",
-    "frozen",
-    "idle",
-    "not-followed",
-)  # figures in the wrong unit mean nothing
+_CAUSES = {
+    # figures in a wrong unit mean nothing
+    "units": ("jump", "fps", "frozen", "idle", "not-followed", "clipped"),
+    # an action that is cut off stands still while the joint goes on
+    "clipped": ("frozen", "not-followed"),
+}
+"""By check, what follows from what it finds, and is not told again."""
 _CURVES = 3  # findings of an episode with a picture of the moment
 _POINTS = 160  # of a curve
 _AROUND = 1.0  # s that a curve shows before and after its finding
@@ -92,17 +96,19 @@ def judge(episode: Episode) -> Judgement:
     result.shots = [s for i in reasons[:1] if (s := _shot(episode, i, findings[i])) is not None]
     result.key, result.shape = _key(episode), shape_of(episode)
     result.kind = _kind(episode)
+    result.sums = metadata.sums_of(episode)
     return result
 
 
 def _causes(findings: list[Finding]) -> list[Finding]:
-    """Without what follows from another finding: in another unit, all is too quick; and a few
-    joints that leap by a turn are no other unit.
+    """Without what follows from another finding (:data:`_CAUSES`); and a joint or two that leap by
+    a turn are no other unit.
     """
-    leaps = {f.part for f in findings if f.check == "jump" and f.joints}
+    leaps = {f.part for f in findings if f.check == "jump" and 0 < len(f.joints) <= 2}
     findings = [f for f in findings if f.check != "units" or f.part not in leaps]
-    units = {f.part for f in findings if f.check == "units"}
-    return [f for f in findings if not (f.check in _BY_UNITS and f.part in units)]
+    parts = {(cause, f.part) for f in findings for cause in _CAUSES if f.check == cause}
+    hidden = {(check, part) for cause, part in parts for check in _CAUSES[cause]}
+    return [f for f in findings if (f.check, f.part) not in hidden]
 
 
 def _curve(episode: Episode, number: int, finding: Finding) -> Curve | None:

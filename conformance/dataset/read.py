@@ -61,7 +61,7 @@ def episode_of_session(session: Session) -> Episode:
         form=session.form,
         fps=session.stated_rate or session.rate,
         t=times,
-        tracks=[_track_of_part(part) for part in session.parts],
+        tracks=[_track_of_part(part, session.touches.get(part.name)) for part in session.parts],
         measured=session.clock == MEASURED,
         stamps=session.stamps,
         numbers=session.numbers,
@@ -74,7 +74,7 @@ def episode_of_session(session: Session) -> Episode:
     )
 
 
-def _track_of_part(part: Part) -> Track:
+def _track_of_part(part: Part, touch: Floats | None) -> Track:
     state, command = part.values.get(STATE, {}), part.values.get(COMMAND, {})
     return Track(
         part.name,
@@ -83,6 +83,7 @@ def _track_of_part(part: Part) -> Track:
         action=command.get("q"),
         dq=state.get("dq"),
         tau=state.get("tau"),
+        touch=touch,
         model=part.model,
     )
 

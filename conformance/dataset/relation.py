@@ -12,11 +12,12 @@ from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.motion import stroke
 from dexkit.hand import Floats
 
-__all__ = ["Moments", "Relation", "correlations", "moments", "relations", "shifted"]
+__all__ = ["Moments", "Relation", "correlations", "moments", "relations", "running", "shifted"]
 
 _RATE = 25.0  # Hz at which parts are compared: hands and arms move below 5 Hz
 _EARLIEST = 0.4  # s by which a state may be ahead: a set whose action is late is judged elsewhere
 _LATEST = 1.0  # s of delay that are tried: hands and their recorders take up to 0.6
+_LATE = 0.6  # s that a hand may take to begin: Inspire's take 0.4 behind a robot's network
 _LEAST = 12  # frames that are compared at least
 _MOVES = 0.04  # of the stroke: less is noise, or the last step of a coarse encoder (64 of a stroke)
 
@@ -134,6 +135,18 @@ class Relation:
         state, action = self.pair
         return np.asarray(np.abs(state - action).max(axis=0))
 
+    @cached_property
+    def asked(self) -> tuple[Floats, Floats]:
+        """Lowest and highest position that each joint was asked for in the time that it may take to
+        begin, shape (n, joints).
+        """
+        late = max(_LATE, self.lag * self.step + 0.3)
+        back, ahead = max(1, round(late / self.step)), max(1, round(0.1 / self.step))
+        return (
+            running(self.action, back, ahead, np.minimum),
+            running(self.action, back, ahead, np.maximum),
+        )
+
     @property
     def lags(self) -> range:
         """Delays, in frames, that a hand or an arm may have."""
@@ -195,6 +208,18 @@ def _lag(state: Floats, action: Floats, wide: Floats, step: float) -> int:
         for k in range(-back, late + 1)
     ]
     return int(np.argmax(score)) - back
+
+
+def running(values: Floats, back: int, ahead: int, best: np.ufunc) -> Floats:
+    """The best of the last ``back`` and the next ``ahead`` rows, for each row."""
+    found, reach = values, 1
+    wide = back + ahead + 1
+    while reach < wide:
+        step = min(reach, wide - reach)
+        moved = np.concatenate((np.repeat(found[:1], step, axis=0), found[:-step]))[: len(values)]
+        found, reach = best(found, moved), reach + step
+    last = np.repeat(found[-1:], ahead, axis=0)
+    return np.asarray(np.concatenate((found[ahead:], last))[: len(values)])
 
 
 def shifted(state: Floats, action: Floats, lag: int) -> tuple[Floats, Floats]:

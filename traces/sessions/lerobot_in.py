@@ -30,6 +30,7 @@ from dexkit.traces.sessions.lerobot_format import (
     COLUMNS,
     EXTENSION,
     PICTURES,
+    PRESSURE,
     parquet_library,
     read_parquet,
 )
@@ -229,6 +230,8 @@ class Dataset:
         session.stamps = _column(table, "timestamp")
         session.numbers = _column(table, "frame_index")
         session.features = features
+        if joints_only:
+            session.touches = self._touches(table)
         if not joints_only:
             session.rest = self._rest(path, table)
         if (origin := self.info.dexkit.sessions.get(str(episode))) is not None:
@@ -489,6 +492,20 @@ class Dataset:
                 problems.add(f"{column} has values that are not finite; these frames lack it")
             found[column] = matrix
         return found
+
+    def _touches(self, table: Any) -> dict[str, Floats]:
+        """The pressures of each hand, as dexkit's export names them."""
+        if PRESSURE not in table.column_names or PRESSURE not in self.info.features:
+            return {}
+        matrix = _matrix(table, PRESSURE)
+        names = None if matrix is None else _names(self.info.features[PRESSURE], matrix.shape[1])
+        if matrix is None or names is None:
+            return {}
+        columns = {
+            f"{side}{HAND}": [i for i, name in enumerate(names) if _side(name) is side]
+            for side in Side
+        }
+        return {part: matrix[:, places] for part, places in columns.items() if places}
 
     def _parts(
         self, features: Mapping[str, Floats], problems: Problems, corrections: list[str]

@@ -150,6 +150,7 @@ class Session:
     :param numbers: the numbers that it gives its frames, likewise.
     :param stated_rate: frames a second that the source states, where its times say something else.
     :param features: of a dataset, its columns of joints by name, shape (frames, elements).
+    :param touches: of a dataset, the pressures of each hand's elements, by its part.
     """
 
     source: Path
@@ -171,6 +172,7 @@ class Session:
     numbers: Floats | None = None
     stated_rate: float | None = None
     features: Mapping[str, Floats] = field(default_factory=dict)
+    touches: Mapping[str, Floats] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.times_ns)

@@ -13,7 +13,6 @@ from functools import lru_cache
 import numpy as np
 
 from dexkit.conformance.dataset.check import Check, Data
-from dexkit.conformance.dataset.checks.units import other_units
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.limits import order_by_limits, other_side_by_limits, rows_of
@@ -25,9 +24,10 @@ from dexkit.conformance.dataset.relation import (
     relations,
     shifted,
 )
+from dexkit.conformance.dataset.unit_fit import other_units
 from dexkit.hand import Floats
 
-__all__ = ["CHECKS", "misassigned"]
+__all__ = ["CHECKS", "assigned", "misassigned"]
 
 _FOLLOWS = 0.75  # correlation of a part with the action that it follows; an object lowers it
 _JOINT = 0.85  # likewise of one joint
@@ -35,17 +35,20 @@ _LEAD = 0.3  # by which it follows the other one better than its own
 _MOVES = 0.1  # strokes that a part moves, to be compared
 _NEARER = 0.4  # of its distance from its own action, is that from the other one
 _APART = 0.03  # strokes RMS from its own action, at least: noise, a coarse encoder, lag
+_AHEAD = 0.08  # s that no state is ahead of its action
+_APART_S = 0.2  # s that no two hands of a robot differ in delay
 _OPPOSITE = -0.8  # correlation of a joint that moves against its action
 _RECORDED = ("left and right hand look swapped", "states of left and right hand exchanged")
 
 
 def misassigned(episode: Episode, part: str) -> bool:
     """Whether a part's columns are those of another side, joint, or sign."""
-    return any(f.part in ("", part) for f in _found(episode) if f.use is not Use.KEEP)
+    return any(f.part in ("", part) for f in assigned(episode) if f.use is not Use.KEEP)
 
 
 @lru_cache(maxsize=1)  # of the episode that is being judged
-def _found(episode: Episode) -> tuple[Finding, ...]:
+def assigned(episode: Episode) -> tuple[Finding, ...]:
+    """What is found of sides, order and signs, and of units that count backwards."""
     exchanged = list(_sides(episode))
     parts = {f.part for f in exchanged}
     if "" in parts:
@@ -55,7 +58,7 @@ def _found(episode: Episode) -> tuple[Finding, ...]:
 
 
 def _named(name: str, episode: Episode) -> Iterator[Finding]:
-    yield from (f for f in _found(episode) if f.check == name)
+    yield from (f for f in assigned(episode) if f.check == name)
 
 
 # -- sides -------------------------------------------------------------------------------------
@@ -99,7 +102,9 @@ def _once(text: str) -> str:
 
 def _exchanged(left: Relation, right: Relation) -> str | None:
     own = [_follows(r) for r in (left, right)]
-    if min(own) >= 0.9:
+    ahead = min(left.lag * left.step, right.lag * right.step) < -_AHEAD
+    ahead = ahead and abs(left.lag - right.lag) * left.step > _APART_S
+    if min(own) >= 0.9 and not ahead:
         return None
     pairs = [(left, right), (right, left)]
     moves = [(_moves(s.state_span, s), _moves(a.action_span, a)) for s, a in pairs]
@@ -107,12 +112,17 @@ def _exchanged(left: Relation, right: Relation) -> str | None:
         return None  # one stands still where the other moves: it does not follow it
     there = [pair for pair, (moved, _) in zip(pairs, moves, strict=True) if moved]
     crossed = [_crossed(s, a) for s, a in there]
-    correlation = min(c for c, _ in crossed)
-    nearer = all(
-        near < _NEARER * float(np.median(s.apart[s.state_span > _MOVES * s.stroke]))
-        for (s, _), (_, near) in zip(there, crossed, strict=True)
-    )
-    if correlation < _FOLLOWS or max(own) > correlation - (0 if nearer else _LEAD):
+    correlation = min(c for c, _, _ in crossed)
+    lead = min(c - _follows(s) for (s, _), (c, _, _) in zip(there, crossed, strict=True))
+    parts_of = [
+        near / max(float(np.median(s.apart[s.state_span > _MOVES * s.stroke])), 1e-9)
+        for (s, _), (_, near, _) in zip(there, crossed, strict=True)
+    ]
+    nearer = min(parts_of) < _NEARER and max(parts_of) < 1 and lead > _LEAD / 3
+    lags = [lag for _, _, lag in crossed]
+    # both follow the other side with one delay, and their own only if one is ahead of its action
+    in_time = ahead and (max(lags) - min(lags)) * left.step < _AHEAD and lead > -0.02
+    if correlation < _FOLLOWS or not (lead > _LEAD or nearer or in_time):
         return None
     part = left.part.removeprefix("left_")
     return (
@@ -133,23 +143,24 @@ def _follows(r: Relation) -> float:
     return float((m.cov / square).sum()) / size if size > 1e-9 else 0.0
 
 
-def _crossed(state: Relation, action: Relation) -> tuple[float, float]:
+def _crossed(state: Relation, action: Relation) -> tuple[float, float, int]:
     """Correlation of a state with the action of the other side at the best delay, and the median
-    distance, strokes RMS. Signs do not count between two sides, which are mirrored.
+    distance, strokes RMS, and that delay, frames. Signs do not count between two sides, which
+    are mirrored.
     """
     count = min(len(state.t), len(action.t))
     s, a = state.state[:count] / state.stroke, action.action[:count] / action.stroke
-    best, near = 0.0, np.inf
+    best, near, best_lag = 0.0, np.inf, 0
+    moved = state.state_span > _MOVES * state.stroke
     for lag in state.lags:
         m = moments(*shifted(s, a, lag))
         size = float(np.sqrt(m.var_s.sum() * m.var_a.sum()))
-        if size > 1e-9:
-            best = max(best, float(np.abs(m.cov).sum()) / size)
-            moved = state.state_span > _MOVES * state.stroke
-            near = min(
-                near, float(np.median(m.apart()[moved])), float(np.median(m.apart(-1.0)[moved]))
-            )
-    return best, near
+        if size <= 1e-9:
+            continue
+        if (value := float(np.abs(m.cov).sum()) / size) > best:
+            best, best_lag = value, lag
+        near = min(near, *(float(np.median(m.apart(sign)[moved])) for sign in (1.0, -1.0)))
+    return best, near, best_lag
 
 
 # -- order and signs ---------------------------------------------------------------------------
@@ -170,6 +181,14 @@ def _joints(r: Relation) -> Iterator[Finding]:
             f"order: the observation has {names}{' ...' if len(order) > 2 else ''}",
             part=r.part,
             joints=tuple(sorted(order)),
+        )
+    elif signs and _of_travel(r) and len(signs) == int(r.moving.sum()):
+        yield Finding(
+            "units",
+            Use.DROP,
+            f"{part_text(r.part)}: observation and action count in opposite directions: one of "
+            "them is 1 to 0, not 0 to 1",
+            part=r.part,
         )
     elif signs:
         joints = sorted(signs)
@@ -198,6 +217,12 @@ def _joints(r: Relation) -> Iterator[Finding]:
                 return
 
 
+def _of_travel(r: Relation) -> bool:
+    """Whether it is a hand that counts in parts of its travel, as far as can be told."""
+    model = r.track.model
+    return r.track.is_hand and (len(r.track.joints) == 6 if model is None else model.unit != "rad")
+
+
 def _order(r: Relation, signs: dict[int, tuple[float, float]]) -> dict[int, int]:
     """By joint, whose action its state follows, where a group of joints is permuted."""
     moving = np.minimum(r.state_span, r.action_span) > _MOVES * r.stroke
@@ -206,16 +231,16 @@ def _order(r: Relation, signs: dict[int, tuple[float, float]]) -> dict[int, int]
     sure = np.median(r.own[moving]) > _FOLLOWS
     best: dict[int, int] = {}
     for lag in [r.lag] if sure else r.lags[::2]:
-        found = _cycles(_leaders(r, *shifted(r.state, r.action, lag), signs))
+        found = _exchanged_joints(r, *shifted(r.state, r.action, lag), signs)
         if len(found) > len(best):
             best = found
     return best
 
 
-def _leaders(
+def _exchanged_joints(
     r: Relation, state: Floats, action: Floats, signs: dict[int, tuple[float, float]]
 ) -> dict[int, int]:
-    """By joint whose state follows another joint's action far better than its own: that one."""
+    """By joint of a permuted group, that whose action its state follows far better than its own."""
     count = len(state)
     c = correlations(state, action)
     square = (
@@ -224,18 +249,28 @@ def _leaders(
         - 2 / count * np.einsum("ij,ik->jk", state, action)
     )
     away = np.sqrt(np.maximum(square, 0.0)) / r.stroke[:, None]
+    own_c, own = np.diagonal(c)[:, None], np.diagonal(away)[:, None]
+    better = (c > _JOINT) & (own_c < c - _LEAD) & (away < 0.7 * own)
+    nearer = (c > _JOINT) & (away < _NEARER * own) & (own_c <= c)
+    # of two that are exchanged one may have been stopped by an object
+    perhaps = (c > _FOLLOWS) & (away < 0.9 * own) & (c > own_c + 0.1)
+    wrong = (own[:, 0] > _APART) & (r.state_span > _MOVES * r.stroke)
+    for j, (_, left) in signs.items():
+        wrong[j] &= away[j].min() < left  # inverted is nearer than exchanged
+    fits = (better | nearer | perhaps) & wrong[:, None] & wrong[None]
+    np.fill_diagonal(fits, False)
+    # joints of a finger move alike: the nearest pairs first, each joint once
     found: dict[int, int] = {}
-    for j in np.flatnonzero(r.state_span > _MOVES * r.stroke).tolist():
-        k = int(np.argmax(c[j] - away[j]))
-        own = away[j, j]
-        if k == j or c[j, k] < _JOINT or own < _APART:
-            continue
-        if j in signs and signs[j][1] < away[j, k]:
-            continue  # inverted is nearer than exchanged
-        better = c[j, j] < c[j, k] - _LEAD and away[j, k] < 0.7 * own
-        if better or (away[j, k] < _NEARER * own and c[j, j] <= c[j, k]):
+    taken: set[int] = set()
+    score = np.where(fits, c - away, -np.inf)
+    for place in np.argsort(-score, axis=None)[: int(fits.sum())].tolist():
+        j, k = divmod(place, len(c))
+        if j not in found and k not in taken:
             found[j] = k
-    return found
+            taken.add(k)
+    cycles = _cycles(found)
+    sure = [j for j, k in cycles.items() if better[j, k] or nearer[j, k]]
+    return cycles if 2 * len(sure) >= len(cycles) else {}
 
 
 def _cycles(leaders: dict[int, int]) -> dict[int, int]:

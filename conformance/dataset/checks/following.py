@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.dataset.check import Check, Data, Figure
 from dexkit.conformance.dataset.checks.assignment import misassigned
-from dexkit.conformance.dataset.checks.units import other_units
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.motion import joints_text, runs_of
 from dexkit.conformance.dataset.relation import Relation, relations
+from dexkit.conformance.dataset.unit_fit import is_radians, other_units
 from dexkit.hand import Floats
 
 __all__ = ["CHECKS"]
@@ -34,6 +34,7 @@ _TOWARDS = 0.08  # strokes that a joint moves towards its action within these, i
 _MOST = 0.75  # of the joints that are asked
 _ASKED = 0.3  # strokes of closing that are asked of a hand that stays open, to count
 _NEVER = 0.07  # strokes of motion that are none: what noise, friction and the other fingers cause
+_FOLLOWS = 0.85  # correlation of a joint with its action, although an object stops it
 _OPEN = 0.15  # strokes from the open end, within which a hand is open
 _STRAIGHT = 0.97  # correlation of a joint that moves in proportion, with the noise of encoders
 _GAIN = 0.4  # of the action's motion: less is no joint that is driven, in free air
@@ -49,12 +50,14 @@ def _followed(episode: Episode) -> Iterator[Finding | Figure]:
             continue  # told with its cause
         bad = np.zeros(r.state.shape, dtype=bool)
         if (r.farthest > _short(r)).any():
-            low, high = _asked(r)
+            low, high = r.asked
             bad = (_not_driven(r, low, high) | _stays_open(r, low, high)) & asked
         weak = _weak(r)
         shares.append(1 - float((bad | weak).any(axis=1).mean()))
         found = _finding(r, bad, weak)
-        if found is not None:
+        if found is not None and (backwards := _backwards(r)) is not None:
+            yield backwards
+        elif found is not None:
             yield found
     if shares:
         yield Figure("following, %", 100 * min(shares))
@@ -107,28 +110,30 @@ def _finding(r: Relation, bad: Mask, weak: NDArray[np.bool_]) -> Finding | None:
     )
 
 
-def _asked(r: Relation) -> tuple[Floats, Floats]:
-    """Lowest and highest position that each joint was asked for, in the time that it may take to
-    begin, shape (n, joints).
+def _backwards(r: Relation) -> Finding | None:
+    """A hand that is stopped on the wrong side, again and again, and follows otherwise: it counts
+    backwards, by state and action.
     """
-    late = max(_LATE, r.lag * r.step + 0.3)
-    back, ahead = max(1, round(late / r.step)), max(1, round(0.1 / r.step))
-    return (
-        _running(r.action, back, ahead, np.minimum),
-        _running(r.action, back, ahead, np.maximum),
+    closing, limits = r.track.closing, r.track.limits
+    if closing is None or limits is None or len(closing) < 2 or is_radians(r.track):
+        return None
+    moving = r.moving & (closing != 0)
+    if not moving.any() or r.own[moving].min() < _FOLLOWS:
+        return None
+    low, high = r.asked
+    short = _short(r)
+    # what would be an object, if it were the other way round, and what would be none then
+    over = (r.state - high > short) & (closing > 0) | (low - r.state > short) & (closing < 0)
+    under = (low - r.state > short) & (closing > 0) | (r.state - high > short) & (closing < 0)
+    if under.any() or not over[:, moving].any(axis=0).all():
+        return None
+    return Finding(
+        "units",
+        Use.REVIEW,
+        f"{joints_text(r.track, range(len(closing)))} is stopped where it opens and never where it "
+        "closes: observation and action are 1 to 0, not 0 to 1, or it is another model",
+        part=r.part,
     )
-
-
-def _running(values: Floats, back: int, ahead: int, best: np.ufunc) -> Floats:
-    """The best of the last ``back`` and the next ``ahead`` rows, for each row."""
-    found, reach = values, 1
-    wide = back + ahead + 1
-    while reach < wide:
-        step = min(reach, wide - reach)
-        moved = np.concatenate((np.repeat(found[:1], step, axis=0), found[:-step]))[: len(values)]
-        found, reach = best(found, moved), reach + step
-    last = np.repeat(found[-1:], ahead, axis=0)
-    return np.asarray(np.concatenate((found[ahead:], last))[: len(values)])
 
 
 def _short(r: Relation) -> Floats:

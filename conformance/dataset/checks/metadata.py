@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 
 from dexkit.conformance.dataset.check import Check, Data
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding, Use
+from dexkit.conformance.dataset.limits import rows_of
 from dexkit.hand import Floats
 
-__all__ = ["CHECKS", "differs"]
+__all__ = ["CHECKS", "differs", "sums_of"]
 
 _OFF = 0.02  # of the range of a value: more than rounding, or a sample of the frames, makes
 _ROUNDED = 2e-4  # of the size of a value, that files with few digits lose
@@ -51,6 +53,10 @@ def _task(episode: Episode) -> Iterator[Finding]:
         yield Finding(
             "task", Use.REVIEW, f"it has no task text{only}, which policies with language need"
         )
+    elif any("\ufffd" in text for text in told):
+        yield Finding(
+            "readable", Use.REVIEW, f"its task text is not UTF-8, and is damaged: {told[0]!r}"
+        )
     elif all(text.lower().strip("<>[]().") in _NAMES_NOTHING for text in told):
         yield Finding("task", Use.KEEP, f"its task is called {told[0]!r}, which says nothing of it")
 
@@ -71,7 +77,7 @@ def _statistics(episode: Episode) -> Iterator[Finding]:
                 limit=float(len(values)),
             )
             continue
-        true = numbers_of(values)
+        true = numbers_of(episode).get(feature, {})
         wrong = {name: d for name in true if (d := differs(stated.get(name), true[name], true))}
         if wrong:
             yield Finding("statistics", Use.REVIEW, _sentence(feature, wrong, "the episode"))
@@ -82,17 +88,32 @@ def _sentence(feature: str, wrong: dict[str, str], whose: str) -> str:
     return f"the metadata state other numbers of {feature} than {whose} has: {what}"
 
 
-def numbers_of(values: Floats) -> dict[str, Floats]:
-    """``min``, ``max``, ``mean`` and ``std`` of each element, shape (elements,), without NaN."""
-    if not np.isfinite(values).all():
-        values = values[np.isfinite(values).all(axis=1)]
-        if not len(values):
-            return {}
+@lru_cache(maxsize=1)  # of the episode that is being judged: it is needed twice
+def numbers_of(episode: Episode) -> dict[str, dict[str, Floats]]:
+    """By feature ``min``, ``max``, ``mean`` and ``std`` of each element, shape (elements,), of the
+    frames that are finite.
+    """
+    found = {}
+    for feature, values in episode.features.items():
+        rows = rows_of(values)
+        if len(rows):
+            found[feature] = {
+                "min": rows.min(axis=0),
+                "max": rows.max(axis=0),
+                "mean": rows.mean(axis=0),
+                "std": rows.std(axis=0),
+            }
+    return found
+
+
+def sums_of(episode: Episode) -> dict[str, list[list[float]]]:
+    """The same in few digits, with the number of frames, for :attr:`Judgement.sums`."""
     return {
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
+        feature: [
+            *([float(f"{v:.7g}") for v in numbers.tolist()] for numbers in found.values()),
+            [float(len(episode.features[feature]))],
+        ]
+        for feature, found in numbers_of(episode).items()
     }
 
 
