@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dexkit.conformance.dataset import cameras as decoding
+from dexkit.conformance.dataset.camera_lag import motion_of
 from dexkit.conformance.dataset.camera_sets import never_moving
 from dexkit.conformance.dataset.cameras import CameraTrack, not_judged, picture, tracks_of
 from dexkit.conformance.dataset.checks.cameras import camera_findings
@@ -397,6 +398,26 @@ def test_a_frozen_stretch_is_found(
     assert (found.check, found.use, found.part) == ("camera-frozen", Use.DROP, "camera v")
     assert found.begin_s == pytest.approx(stretch[0], abs=1.0)
     assert found.end_s == pytest.approx(stretch[1], abs=0.5)
+
+
+@each(
+    "name",
+    {
+        "on the right wrist": ("cam_right_wrist", {"right_arm"}),
+        "on the left wrist": ("left_wrist_2", {"left_arm"}),
+        "left eye of the head": ("cam_left_high", {"left_arm", "right_arm"}),
+        "no words": ("相机 1", {"left_arm", "right_arm"}),
+    },
+)
+def test_a_camera_on_a_wrist_is_compared_with_its_own_arm(
+    tmp_path: Path, name: tuple[str, set[str]]
+) -> None:
+    episode = episode_with(tmp_path, reaches(8, FPS))
+    left = Track("left_arm", ("elbow",), state=reaches(8, FPS, 0.5)[:, None])
+    episode.tracks.append(left)
+    motion = motion_of(episode)
+    moved = motion.seen_by(name[0]).travel(np.array([0.0]), np.array([5.0]))[0] > 0
+    assert {p for p, moves in zip(motion.parts, moved, strict=True) if moves} == name[1]
 
 
 def test_a_camera_that_never_moves_is_found_beside_other_episodes(tmp_path: Path) -> None:

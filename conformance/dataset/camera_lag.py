@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -19,6 +20,7 @@ Lags = NDArray[np.int_]
 
 DRIFT = 0.25
 """Seconds between start and end from which on a picture drifts."""
+_ON_ARMS = frozenset({"wrist", "hand", "arm", "gripper", "ee"})
 _DEAD = 0.01  # of a joint's stroke, which noise of the encoder may be
 _STEP = 0.05  # s between values of speed that are compared
 _SMOOTH = 3  # of them, over which joints and picture are smoothed alike
@@ -58,6 +60,19 @@ class Motion:
             for i in range(len(self.parts)):
                 found[:, i] = speeds[:, self.part == i].sum(axis=1)
         return found
+
+    def seen_by(self, camera: str) -> Motion:
+        """What a camera may see by its name: one on a wrist does not see the other arm move."""
+        words = set(re.findall(r"[a-z]+", camera.lower()))
+        sides = words & {"left", "right"}
+        if len(sides) != 1 or not words & _ON_ARMS:
+            return self  # cam_left_high is the left eye of a head
+        other = ({"left", "right"} - sides).pop()
+        kept = [i for i, name in enumerate(self.parts) if not name.startswith(other)]
+        if not any(self.parts[i].startswith(*sides) for i in kept):
+            return self
+        columns = np.isin(self.part, kept)
+        return replace(self, positions=self.positions[:, columns], part=self.part[columns])
 
     @property
     def _period(self) -> float:

@@ -45,8 +45,8 @@ _STILL = 3  # grey levels of a block, that coding alone changes in a picture tha
 _ANSWER = 6  # levels by which a block changes where something moves in it
 _MOVES = 0.02  # strokes, all joints together, in a window in which something moves
 _LEAST_MOTION = 0.15  # strokes within a frozen stretch; less may be out of sight
-_ANSWERS = 0.7  # share of comparable windows elsewhere in which the picture answers
-_STRAY = 0.1  # share of a frozen stretch's windows in which coding looks like an answer
+_ANSWERS = 0.85  # share of comparable windows elsewhere in which the picture answers
+_MOST_CODING = 20  # levels by which coding changes a block of a frozen picture
 _LEAST_WINDOWS = 16  # with motion: 2 s
 _SHOWN = 15  # levels by which a block differs where something is in it
 _LEAST_COMPARABLE = 6  # of such windows: 1.5 s
@@ -263,7 +263,7 @@ def _is_frozen(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool
     if leap is not None and _is_unexplained(track, motion, leap):
         return True
     # what moves may leave the view; then the picture shows it no more
-    ends = end >= len(track) - 3
+    ends = track.t[-1] - track.t[end - 1] < _REFRESH
     goes_on = _shows_something(track, begin, end) if ends else _is_far(track, leap)
     return goes_on and _would_answer(track, motion, begin, end)
 
@@ -290,26 +290,28 @@ def _noise_stops(track: CameraTrack, motion: Motion, begin: int, end: int) -> bo
     return bool(np.mean(track.altered[1 : len(alive) + 1][rests] > _NOISE) > _LEAST_ALIVE)
 
 
-def _windows(track: CameraTrack, motion: Motion) -> tuple[Floats, Floats, Mask]:
-    """Begins of short windows, s, how far each part gets in them, shape (windows, parts), and
-    whether the picture answers.
+def _windows(track: CameraTrack, motion: Motion) -> tuple[Floats, Floats, Floats]:
+    """Begins of short windows, s, how far each part gets in them, shape (windows, parts), and by
+    how much the block that changes most does.
     """
     at: Floats = np.arange(0.0, float(motion.t[-1]) - _STEP, _STEP / 2, dtype=np.float64)
     moved = motion.travel(at, at + _STEP)
     a, b = (np.clip(np.searchsorted(track.t, x), 0, len(track) - 1) for x in (at, at + _STEP))
     difference = np.abs(track.thumbs[b].astype(np.int16) - track.thumbs[a])
-    return at, moved, difference.max(axis=(1, 2)) >= _ANSWER
+    return at, moved, difference.max(axis=(1, 2)).astype(np.float64)
 
 
 def _would_answer(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool:
     """Whether the picture answers elsewhere to less motion of the same parts than here."""
     first, last = float(track.t[begin]), float(track.t[end - 1])
-    at, moved, answers = _windows(track, motion)
+    at, moved, changed = _windows(track, motion)
     total = moved.sum(axis=1)
     here = (at >= first) & (at + _STEP <= last) & (total > _MOVES)
     outside = ((at + _STEP < first) | (at > last)) & (total > _MOVES)
-    if not here.any() or answers[here].mean() > _STRAY:
+    coding = float(np.quantile(changed[here], 0.9)) if here.any() else np.inf
+    if coding > _MOST_CODING:
         return False
+    answers = changed >= max(_ANSWER, 2 * coding)
     shares = []
     for window in np.flatnonzero(here).tolist():
         # no part moves more there than here, and all together not much less
@@ -422,15 +424,15 @@ def _missing(episode: Episode) -> Iterator[Finding]:
 
 
 def _seen(track: CameraTrack, motion: Motion) -> Iterator[Figure]:
-    """In how much of the motion the picture moves; only where all arms move."""
+    """In how much of the motion the picture moves; only where all arms that it may see move."""
     if len(track) < 4 or len(motion.t) < 4:
         return
-    _, moved, answers = _windows(track, motion)
-    arms = [i for i, name in enumerate(motion.parts) if name.endswith("arm")]
+    _, moved, changed = _windows(track, motion)
+    arms = [i for i in np.unique(motion.part).tolist() if motion.parts[i].endswith("arm")]
     ways = moved[:, arms].sum(axis=0) if arms else moved.sum(axis=0)
     moving = moved.sum(axis=1) > _MOVES
     if moving.sum() >= _LEAST_WINDOWS and ways.min(initial=np.inf) >= _LEAST_MOTION:
-        share = 100 * float(answers[moving].mean())
+        share = 100 * float((changed[moving] >= _ANSWER).mean())
         yield Figure(f"motion seen by {_part(track)}, %", round(share, 1))
 
 
@@ -439,14 +441,15 @@ def _frozen(episode: Episode) -> Iterator[Finding | Figure]:
     for track, lag in zip(tracks_of(episode), _lags_of(episode), strict=True):
         # what a late picture does not show yet has not frozen
         late_by = np.zeros(len(track)) if lag is None else lag.at(track.t)
-        yield from frozen(replace(track, t=track.t - late_by), motion, late_by)
-        yield from _seen(track, motion)
+        seen = motion.seen_by(track.name)
+        yield from frozen(replace(track, t=track.t - late_by), seen, late_by)
+        yield from _seen(track, seen)
 
 
 @lru_cache(maxsize=1)
 def _lags_of(episode: Episode) -> tuple[Lag | None, ...]:
     motion = motion_of(episode)
-    return tuple(Lag.of(track, motion) for track in tracks_of(episode))
+    return tuple(Lag.of(track, motion.seen_by(track.name)) for track in tracks_of(episode))
 
 
 def _late(episode: Episode) -> Iterator[Finding | Figure]:
