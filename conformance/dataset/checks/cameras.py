@@ -44,6 +44,7 @@ _STEP = 0.25  # s of a window in which joints and picture are compared
 _STILL = 3  # grey levels of a block, that coding alone changes in a picture that is the same
 _ANSWER = 6  # levels by which a block changes where something moves in it
 _MOVES = 0.02  # strokes, all joints together, in a window in which something moves
+_LEAST_EQUAL = 0.4  # share of a frozen stretch's pictures that are equal to the one before
 _LEAST_MOTION = 0.15  # strokes within a frozen stretch; less may be out of sight
 _ANSWERS = 0.85  # share of comparable windows elsewhere in which the picture answers
 _MOST_CODING = 20  # levels by which coding changes a block of a frozen picture
@@ -257,6 +258,8 @@ def _is_frozen(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool
     first, last = float(track.t[begin]), float(track.t[end - 1])
     if _path(motion, first, last).sum() < _LEAST_MOTION:
         return False
+    if not _are_equal(track, begin, end):
+        return False  # a live picture of a still scene
     if _noise_stops(track, motion, begin, end):
         return True
     leap = _leap(track, end)
@@ -266,6 +269,14 @@ def _is_frozen(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool
     ends = track.t[-1] - track.t[end - 1] < _REFRESH
     goes_on = _shows_something(track, begin, end) if ends else _is_far(track, leap)
     return goes_on and _would_answer(track, motion, begin, end)
+
+
+def _are_equal(track: CameraTrack, begin: int, end: int) -> bool:
+    """Whether the pictures of a still stretch are the same one, to the last bit."""
+    equal = track.altered[begin + 1 : end] == 0
+    longest = max(runs_of(equal), key=lambda run: run[1] - run[0], default=(0, 0))
+    seconds = track.t[begin + longest[1]] - track.t[begin + longest[0]]
+    return bool(equal.mean() >= _LEAST_EQUAL or seconds >= _LEAST)
 
 
 def _noise_stops(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool:
@@ -449,7 +460,7 @@ def _frozen(episode: Episode) -> Iterator[Finding | Figure]:
 @lru_cache(maxsize=1)
 def _lags_of(episode: Episode) -> tuple[Lag | None, ...]:
     motion = motion_of(episode)
-    return tuple(Lag.of(track, motion.seen_by(track.name)) for track in tracks_of(episode))
+    return tuple(Lag.of(track, motion) for track in tracks_of(episode))
 
 
 def _late(episode: Episode) -> Iterator[Finding | Figure]:
