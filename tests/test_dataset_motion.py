@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dexkit.conformance.dataset.episode import Episode, Gap
-from dexkit.conformance.dataset.findings import Use
+from dexkit.conformance.dataset.checks import frames, frozen, idle, jumps, timing
+from dexkit.conformance.dataset.episode import Episode, Gap, Track
+from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.judge import judge
 from dexkit.hand import Floats
+from dexkit.models import model
 from tests.dataset_episodes import Plant, changed, episode, found
 
 FPS = 30
@@ -129,12 +131,12 @@ def test_gaps_of_a_recording() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "size", "words"),
+    ("lasting", "size", "words"),
     [(1, 0.6, "out and back"), (9999, 0.5, "in a frame"), (60, 2 * np.pi, "full turn")],
 )
-def test_jump(frames: int, size: float, words: str) -> None:
+def test_jump(lasting: int, size: float, words: str) -> None:
     def leap(values: Floats) -> Floats:
-        values[150 : 150 + frames, 2] += size
+        values[150 : 150 + lasting, 2] += size
         return values
 
     findings = found(changed(episode(6), "right_arm", state=leap), "jump")
@@ -143,14 +145,14 @@ def test_jump(frames: int, size: float, words: str) -> None:
     assert words in findings[0].text
 
 
-@pytest.mark.parametrize("frames", [-12, 30])
-def test_out_of_step(frames: int) -> None:
-    index = np.clip(np.arange(450) - frames, 0, 449)
+@pytest.mark.parametrize("late", [-12, 30])
+def test_out_of_step(late: int) -> None:
+    index = np.clip(np.arange(450) - late, 0, 449)
     bad = changed(episode(7), "", state=lambda x: x[index])
     [finding] = found(bad, "out-of-step")
     assert all(part in finding.text for part in ("left hand", "right hand", "left arm"))
     lag = judge(bad).figures["lag, s"]
-    assert lag == pytest.approx(frames / FPS + judge(episode(7)).figures["lag, s"], abs=0.05)
+    assert lag == pytest.approx(late / FPS + judge(episode(7)).figures["lag, s"], abs=0.05)
 
 
 def test_drift() -> None:
@@ -225,6 +227,50 @@ def test_idle() -> None:
     [finding] = found(bad, "idle")
     assert finding.value == pytest.approx(10, abs=1.5)
     assert judge(bad).figures["idle, %"] > 35
+
+
+def _odd_values(rng: np.random.Generator, frames: int, joints: int) -> Floats | None:
+    """Numbers as broken sources have them."""
+    values: Floats = rng.normal(0, 1, (frames, joints))
+    kind = rng.integers(0, 9)
+    if kind == 0:
+        return None
+    if kind == 1:
+        values[:] = 0
+    elif kind == 2:
+        values = np.cumsum(values, axis=0) * 0.1
+    elif kind == 3:
+        values[rng.random(frames) < 0.3] = np.nan
+    elif kind == 4:
+        values[:] = np.nan
+    elif kind == 5:
+        values[2:-1] = values[2:3]
+    elif kind == 6:
+        values[:1] = np.inf
+        values[1:] *= 1e300
+    return np.asarray(values)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_odd_data_end_no_check(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    checks = [*frozen.CHECKS, *frames.CHECKS, *jumps.CHECKS, *timing.CHECKS, *idle.CHECKS]
+    for _ in range(40):
+        count = int(rng.choice([0, 1, 2, 3, 5, 9, 20, 60, 150]))
+        fps = float(rng.choice([0.5, 5, 30, 1000]))
+        tracks = []
+        for part in ("left_hand", "right_arm", "robot"):
+            hand = model("dex3-1") if part == "left_hand" and rng.random() < 0.5 else None
+            joints = 7 if hand else int(rng.integers(1, 9))
+            values = [_odd_values(rng, count, joints) for _ in range(4)]
+            names = tuple(f"joint_{i}" for i in range(joints))
+            tracks.append(Track(part, names, *values, model=hand))
+        t = np.arange(count) / fps
+        odd = Episode("odd", "LeRobot v3.0", fps, t, tracks, stamps=t * rng.choice([0, 1, 2]))
+        for check in checks:
+            for what in check.run(odd):
+                if isinstance(what, Finding) and what.value is not None:
+                    assert np.isfinite(what.value)
 
 
 GOOD: dict[str, Episode] = {

@@ -22,12 +22,14 @@ __all__ = [
     "runs_of",
     "series_of",
     "span",
+    "speed_of",
     "stroke",
 ]
 
 Bools = NDArray[np.bool_]
 
 _REVERSALS = 12  # that a joint must show before its noise is spoken of
+_LARGEST = 1e6  # strokes, of numbers that are none: their squares are numbers still
 _STILL = 0.05  # share of frames with no change, at most, of a sensor that is called live: eight
 # such frames in a row are no chance
 
@@ -124,7 +126,7 @@ def _series_of(track: Track, what: str) -> Series | None:
     there: Bools = np.asarray(np.isfinite(values).all(axis=1))
     if there.sum() < 3:
         return None
-    scaled = values / stroke(track)
+    scaled = np.clip(values / stroke(track), -_LARGEST, _LARGEST)
     if not there.all():
         last = np.maximum.accumulate(np.where(there, np.arange(len(there)), -1))
         last[last < 0] = int(np.argmax(there))
@@ -171,6 +173,14 @@ def joined(episode: Episode) -> Bools:
     steps = np.diff(episode.t)
     found[1:] = steps < 1.6 * np.median(steps) if len(steps) else True
     return found
+
+
+def speed_of(track: Track) -> Floats | None:
+    """The velocities that the part states, strokes per second; 0 where there is none."""
+    if track.dq is None or (track.state is None and track.action is None):
+        return None
+    speed = np.nan_to_num(track.dq, posinf=0.0, neginf=0.0) / stroke(track)
+    return np.asarray(np.clip(speed, -_LARGEST, _LARGEST))
 
 
 def frames_of(episode: Episode, seconds: float) -> int:

@@ -228,7 +228,7 @@ def _changing(series: list[Series], frames: slice) -> float:
 def _replayed(episode: Episode, table: _Table, same: Bools) -> Iterator[Finding]:
     """A moving stretch that is there again, to the last digit of states that tremble."""
     n = len(episode)
-    least = frames_of(episode, _REPLAY_S)
+    least = max(frames_of(episode, _REPLAY_S), 5)
     if n < 3 * least:
         return
     matrix = np.concatenate([s.q for s in table.all], axis=1)
@@ -270,8 +270,6 @@ def _unrepeatable(table: _Table, begin: int, end: int) -> bool:
     """Whether the states tremble in a stretch, or it begins or ends with a leap: a simulated
     hand that does the same again has the same numbers again.
     """
-    inside = np.zeros(len(table.all[0].there), dtype=bool)
-    inside[begin:end] = True
     for _, state in table.states:
         turned = state.steps[begin + 1 : end] * state.steps[begin : end - 1] < 0
         sizes = np.abs(state.steps[begin:end]).max(axis=0)

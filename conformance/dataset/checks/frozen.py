@@ -24,7 +24,7 @@ from dexkit.conformance.dataset.motion import (
     part_text,
     runs_of,
     series_of,
-    stroke,
+    speed_of,
 )
 from dexkit.hand import Floats
 
@@ -152,9 +152,9 @@ def _turned(episode: Episode, track: Track, state: Series) -> Floats | None:
     """Where the velocities say that the joints are, in strokes; None without, or where they do
     not agree with the positions while these move.
     """
-    if track.dq is None:
+    speed = speed_of(track)
+    if speed is None:
         return None
-    speed = np.nan_to_num(track.dq) / stroke(track)
     seen = np.where(state.same, 0, state.steps)[1:] * episode.fps
     said = np.where(state.same, 0, 0.5 * (speed + np.roll(speed, 1, axis=0)))[1:]
     product, own, other = (seen * said).sum(), (said * said).sum(), (seen * seen).sum()

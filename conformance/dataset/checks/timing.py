@@ -15,6 +15,7 @@ from dexkit.conformance.dataset.motion import (
     moves,
     part_text,
     series_of,
+    speed_of,
     stroke,
 )
 from dexkit.hand import Floats
@@ -438,9 +439,9 @@ def _velocities(episode: Episode) -> Iterator[Finding]:
     """Velocities against the differences of positions."""
     for track in episode.tracks:
         state = series_of(track, "state")
-        if track.dq is None or state is None or len(state.q) < 30:
+        dq = speed_of(track)
+        if dq is None or state is None or len(state.q) < 30:
             continue
-        dq = np.nan_to_num(track.dq) / stroke(track)
         seen = (state.q[2:] - state.q[:-2]) * (0.5 * episode.fps)
         said = dq[1:-1]
         own, other = (said**2).sum(axis=0), (seen**2).sum(axis=0)
