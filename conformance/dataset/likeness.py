@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.motion import series_of
@@ -20,6 +21,7 @@ _CUT_S = 1.2  # s by which an end may have been cut
 _OTHER = (
     0.03  # difference, against the motion: a copy with noise has less, another take 0.3 or more
 )
+_ROUGH = 0.25  # the same at a shift that is wrong by a quarter of a step, 0.1 for a quick motion
 _STILL = 0.02  # strokes: less is no motion that could be found again
 
 
@@ -87,11 +89,56 @@ def alike(shapes: Mapping[str, Sequence[float]]) -> Iterator[tuple[str, str, flo
         others = np.flatnonzero(
             np.abs(spreads[i + 1 : last] - spreads[i]) < 0.15 * max(spreads[i], 1e-9)
         )
-        for k in (others + i + 1).tolist():
-            other, second = known[k]
+        for k in _near(shape, [known[k][1] for k in (others + i + 1).tolist()]):
+            other, second = known[others[k] + i + 1]
             difference = _difference(shape, second)
             if difference < _OTHER:
                 yield name, other, difference
+
+
+def _near(shape: _Shape, others: Sequence[_Shape]) -> Iterator[int]:
+    """Which of the others may be alike, by a look at all of them together."""
+    for step in {other.step for other in others}:  # never shorter than that of the first
+        places = [i for i, other in enumerate(others) if other.step == step]
+        rows = [others[i].values for i in places]
+        lengths = np.array([len(row) for row in rows])
+        table = np.zeros((len(rows), lengths.max()))
+        for row, values in zip(table, rows, strict=True):
+            row[: len(values)] = values
+        x = shape.values[:: round(step / shape.step)]
+        for i in np.flatnonzero(_rough(x, table, lengths, step) < _ROUGH).tolist():
+            yield places[i]
+
+
+def _rough(x: Floats, table: Floats, lengths: NDArray[np.intp], step: float) -> Floats:
+    """The least difference of one motion from others at shifts of half a step, shape (others,).
+
+    :param table: the others, shape (others, numbers); 0 behind the end of each.
+    """
+    best = np.full(len(table), np.inf)
+    least = 0.85 * np.maximum(lengths, len(x)) - 5
+    reach = int(np.ceil(_CUT_S / step))
+    between = (table[:, 1:] + table[:, :-1]) / 2
+    for shift in range(-reach, reach + 1):
+        for half, values in enumerate((table, between)):
+            begin, end = max(2, 1 - shift), min(len(x) - 2, values.shape[1] - shift)
+            if end - begin < least.min():
+                continue
+            there = np.arange(begin, end) + shift < (lengths - 2 - half)[:, None]
+            count = there.sum(axis=1)
+            wanted = np.where(there, x[begin:end], 0.0)
+            apart = np.where(there, x[begin:end] - values[:, begin + shift : end + shift], 0.0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = np.sqrt(_variance(apart, count) / _variance(wanted, count))
+            good = (count >= least) & np.isfinite(ratio)
+            best[good] = np.minimum(best[good], ratio[good])
+    return best
+
+
+def _variance(values: Floats, count: NDArray[np.intp]) -> Floats:
+    """Of each row, of which ``count`` are values and the others 0."""
+    mean = values.sum(axis=1) / count
+    return np.asarray(np.maximum(np.einsum("ij,ij->i", values, values) / count - mean**2, 0.0))
 
 
 def _difference(a: _Shape, b: _Shape) -> float:
@@ -103,12 +150,9 @@ def _difference(a: _Shape, b: _Shape) -> float:
     best = np.inf
     least = 0.85 * len(y)
     at = np.arange(len(x), dtype=float)
-    # whole steps first: a cheap look at whether they can be alike at all
     reach = int(np.ceil(_CUT_S / step))
     rough = {float(k): _apart(x, y, at, float(k), least) for k in range(-reach, reach + 1)}
     nearest = min(rough, key=lambda k: rough[k])
-    if rough[nearest] > 0.4:
-        return float("inf")
     for shift in np.linspace(nearest - 1, nearest + 1, 33).tolist():
         best = min(best, _apart(x, y, at, shift, least))
     return float(best)
