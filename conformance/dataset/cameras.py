@@ -11,7 +11,7 @@ import io
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -170,6 +170,7 @@ def _stride(height: int, width: int) -> int:
 # ------------------------------------------------------------------------------------
 
 
+@cache
 def _is_there(library: str) -> bool:
     return importlib.util.find_spec(library) is not None
 

@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -472,7 +473,7 @@ class Dataset:
         ):
             problems.add("frame_index does not ascend from 0; frames are counted instead")
             numbers = np.arange(table.num_rows, dtype=np.float64)
-        times = np.array([round(n * period) for n in numbers.tolist()], dtype=np.int64)
+        times = np.rint(numbers * period).astype(np.int64)
         stamps = _column(table, "timestamp")
         if stamps is None or np.abs(stamps - times / 1e9).max(initial=0.0) > 0.5 / self.fps:
             problems.add("timestamp is not frame_index / fps; frame_index / fps is used")
@@ -835,6 +836,7 @@ def _names(feature: _Feature, count: int) -> tuple[str, ...] | None:
     return tuple(found)
 
 
+@lru_cache(maxsize=4096)
 def _words(name: str) -> list[str]:
     """``kLeftHandThumb0`` and ``left_hand_thumb_0`` as words."""
     bare = name.removeprefix("k") if _is_unitree(name) else name
