@@ -19,6 +19,7 @@ from dexkit.conformance.audit.objects import file_system
 from dexkit.conformance.audit.records import EpisodeRecord, Finding, State
 from dexkit.conformance.audit.sessions import is_url, opened, problem_of
 from dexkit.conformance.audit.units import Form, Unit, fetch, tag_of_metadata
+from dexkit.conformance.dataset.cameras import not_judged
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Judgement, Use
 from dexkit.conformance.dataset.judge import checks_digest
@@ -207,7 +208,7 @@ def _of_episode(name: str, episode: Episode, cameras: bool) -> EpisodeRecord:
             "messages": len(episode),
             "model": _models(episode),
             "labels": {"task": one_line(episode.tasks[0], 100)} if episode.tasks else {},
-            "notes": _some(episode.problems),
+            "notes": _some([*not_judged(episode), *episode.problems]),
         },
     )
 

@@ -24,7 +24,7 @@ class Data(str, Enum):
     STAMPS = "times of frames"
     TASK = "task texts"
     STATISTICS = "statistics"
-    CAMERA = "cameras"
+    CAMERA = "cameras, with PyAV for videos and Pillow for pictures (the extra video)"
 
 
 @dataclass(frozen=True)
