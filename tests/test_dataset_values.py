@@ -73,6 +73,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "kinesthetic teaching": {"same": "state"},
     "the action is the next state": {"same": "next"},
     "a trigger": {"kind": "trigger"},
+    "a trigger and an object": {"kind": "trigger", "plant": Plant(block=0.3)},
     "only opens": {"kind": "opens"},
     "never used": {"kind": "still"},
     "to and fro": {"kind": "sine"},

@@ -17,7 +17,7 @@ from dexkit.conformance.dataset.checks.assignment import misassigned
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.motion import joints_text, runs_of
-from dexkit.conformance.dataset.relation import Relation, relations
+from dexkit.conformance.dataset.relation import Relation, moments, relations
 from dexkit.conformance.dataset.unit_fit import is_radians, other_units
 from dexkit.hand import Floats
 
@@ -219,10 +219,32 @@ def _weak(r: Relation) -> NDArray[np.bool_]:
         # nothing holds an arm; a rest of noise in the action is no motion
         return np.asarray(weak & (r.action_span > _SHORT_ARM) & (r.state_span < r.action_span))
     # an object stops a joint: then the line is none
-    straight = (r.own > _STRAIGHT) & (r.action_span > 0.3 * r.stroke)
+    straight = weak & (r.own > _STRAIGHT) & (r.action_span > 0.3 * r.stroke)
+    for joint in np.flatnonzero(straight).tolist():
+        straight[joint] = _weak_when_open(r, joint)
     neither = np.zeros(len(weak), dtype=bool) if r.track.closing is None else r.track.closing == 0
     stuck = neither & (r.state_span < 0.5 * _NEVER * r.stroke) & (r.action_span > 0.2 * r.stroke)
     return np.asarray(weak & (straight | stuck))
+
+
+def _weak_when_open(r: Relation, joint: int) -> bool:
+    """Whether a joint moves less than its action in the open half of the way, too, where hardly an
+    object is met. Of an action of two values, a trigger's, every line is straight.
+    """
+    state, action = r.pair
+    s, a = state[:, joint], action[:, joint]
+    sign = 0.0 if r.track.closing is None else float(r.track.closing[joint])
+    for way in [sign] if sign else [1.0, -1.0]:
+        told = way * a
+        least, wide = told.min(), float(r.action_span[joint])
+        near = told < least + 0.6 * wide
+        between = near & (told > least + 0.15 * wide)
+        if between.sum() < max(8, 0.05 * len(told)):
+            return False
+        m = moments(s[near][:, None], a[near][:, None])
+        if m.correlation[0] < 0.9 or m.cov[0] > _GAIN * m.var_a[0]:
+            return False
+    return True
 
 
 def _action_stuck(r: Relation, joint: int, begin: int, end: int) -> bool:

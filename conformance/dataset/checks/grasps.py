@@ -132,11 +132,14 @@ def _closings(grip: _Grip) -> int:
 def _closes_on(r: Relation, grip: _Grip) -> tuple[int, str] | None:
     """Where the hand closes on while its action does not."""
     wide = round(_LOST_S / r.step)
+    held = max(1, round(_HELD_S / r.step))
     count = len(grip.closed)
-    if count <= 3 * wide:
+    if count <= 3 * wide + held:
         return None
-    at = np.arange(wide, count - wide)
-    before = grip.holds[at - wide]
+    at = np.arange(wide + held, count - wide)
+    # a hand that is on its way is late, and holds nothing
+    came = np.abs(grip.closed[at - wide] - grip.closed[at - wide - held])
+    before = grip.holds[at - wide] & (came < _STEADY)
     gap = (grip.asked - grip.closed)[at - wide]
     went = grip.closed[at] - grip.closed[at - wide]
     same = _steady(r, grip, at, wide, wide // 2)
