@@ -12,7 +12,16 @@ from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.motion import stroke
 from dexkit.hand import Floats
 
-__all__ = ["Moments", "Relation", "correlations", "moments", "relations", "running", "shifted"]
+__all__ = [
+    "Moments",
+    "Relation",
+    "correlations",
+    "middle",
+    "moments",
+    "relations",
+    "running",
+    "shifted",
+]
 
 _RATE = 25.0  # Hz at which parts are compared: hands and arms move below 5 Hz
 _EARLIEST = 0.4  # s by which a state may be ahead: a set whose action is late is judged elsewhere
@@ -155,11 +164,11 @@ class Relation:
     @cached_property
     def increments(self) -> bool:
         """Whether the actions are steps, not positions: they move as the state's speed."""
-        if not self.moving.any() or np.median(self.own[self.moving]) > 0.6:
+        if not self.moving.any() or middle(self.own[self.moving]) > 0.6:
             return False
         speed = np.gradient(self.state, axis=0)
         found = moments(*shifted(speed, self.action, self.lag)).correlation
-        return bool(np.median(found[self.moving]) > 0.8)  # speed is noisy, other signals are 0
+        return middle(found[self.moving]) > 0.8  # speed is noisy, other signals are 0
 
 
 @lru_cache(maxsize=1)  # the episode that is being judged, and no memory for others
@@ -208,6 +217,11 @@ def _lag(state: Floats, action: Floats, wide: Floats, step: float) -> int:
         for k in range(-back, late + 1)
     ]
     return int(np.argmax(score)) - back
+
+
+def middle(values: Floats) -> float:
+    """The median, the higher of two; quicker than numpy's for a few values."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
 
 
 def running(values: Floats, back: int, ahead: int, best: np.ufunc) -> Floats:

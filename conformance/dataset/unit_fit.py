@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.limits import misplaced, reach_of, rows_of
-from dexkit.conformance.dataset.relation import Relation, moments, shifted
+from dexkit.conformance.dataset.relation import Relation, middle, moments, shifted
 from dexkit.hand import Floats
 
 __all__ = ["Units", "is_radians", "other_units", "wrong_units"]
@@ -120,7 +120,7 @@ def other_units(r: Relation) -> Units | None:
     wide = high - low
     moving = np.minimum(r.state_span, r.action_span) > 0
     moving &= np.maximum(r.state_span, r.action_span) > 0.1 * np.minimum(wide, 1.0)
-    if not moving.any() or np.median(r.moments.apart()[moving] / wide[moving]) < _APART:
+    if not moving.any() or middle(r.moments.apart()[moving] / wide[moving]) < _APART:
         return None
     return _converted(r, limits, moving)
 
@@ -129,11 +129,11 @@ def _converted(r: Relation, limits: Limits, moving: NDArray[np.bool_]) -> Units 
     low, high = limits
     wide = high - low
     # the other way round no delay of the two is right
-    sure = np.median(r.own[moving]) > 0.9
+    sure = middle(r.own[moving]) > 0.9
     at = [moments(*shifted(r.state, r.action, k)) for k in ([r.lag] if sure else r.lags)]
-    if max(float(np.median(np.abs(m.correlation[moving]))) for m in at) < _RELATED:
+    if max(middle(np.abs(m.correlation[moving])) for m in at) < _RELATED:
         return None
-    apart = min(float(np.median(m.apart()[moving] / wide[moving])) for m in at)
+    apart = min(middle(m.apart()[moving] / wide[moving]) for m in at)
     best: tuple[float, Units] | None = None
     for name, largest, line in _UNITS if is_radians(r.track) else _OF_PARTS:
         scale, offset = line(low, high)
@@ -146,7 +146,7 @@ def _converted(r: Relation, limits: Limits, moving: NDArray[np.bool_]) -> Units 
                 continue
             if name == _RADIANS and values.max() < _ONE:
                 continue  # an object that stops the fingers is no unit
-            if not _LIKE < np.median((size * spans / np.maximum(others, 1e-9))[moving]) < 1 / _LIKE:
+            if not _LIKE < middle((size * spans / np.maximum(others, 1e-9))[moving]) < 1 / _LIKE:
                 continue  # one of them hardly moves: then it is near everything
             rms = [
                 m.apart(scale, offset)
@@ -154,10 +154,15 @@ def _converted(r: Relation, limits: Limits, moving: NDArray[np.bool_]) -> Units 
                 else size * m.apart(*_back(scale, offset))
                 for m in at
             ]
-            left = min(float(np.quantile((v / wide)[moving], 0.75)) for v in rms)
+            left = min(_upper((v / wide)[moving]) for v in rms)
             if left < min(_FITS, _BETTER * apart) and (best is None or left < best[0]):
                 best = left, Units(which, name, 1 - left)
     return None if best is None else best[1]
+
+
+def _upper(values: Floats) -> float:
+    """The value that a quarter exceeds."""
+    return float(np.sort(values)[(3 * (len(values) - 1) + 3) // 4])
 
 
 def _back(scale: Floats, offset: Floats) -> tuple[Floats, Floats]:
@@ -171,17 +176,17 @@ def _factor(r: Relation) -> Units | None:
     if not close.any():
         return None
     slope = np.abs(r.fit[0][close])
-    middle = float(np.median(slope))
-    if 1 / _FACTOR < middle < _FACTOR or np.ptp(np.quantile(slope, [0.25, 0.75])) > (
-        _SPREAD * middle
+    usual = middle(slope)
+    if 1 / _FACTOR < usual < _FACTOR or np.ptp(np.quantile(slope, [0.25, 0.75])) > (
+        _SPREAD * usual
     ):
         return None
     for text, factor in _FACTORS:
         for which, value in (("state", factor), ("action", 1 / factor)):
-            if abs(np.log(middle / value)) < _NEAR:
+            if abs(np.log(usual / value)) < _NEAR:
                 return Units(which, text, 0.97)
     # less than asked is not followed
-    return Units("state", f"{middle:.3g} times the action", 0.9) if middle > _FACTOR else None
+    return Units("state", f"{usual:.3g} times the action", 0.9) if usual > _FACTOR else None
 
 
 # -- state and action alike --------------------------------------------------------------------
@@ -211,7 +216,7 @@ def wrong_units(episode: Episode, track: Track) -> Units | None:
             made = v * scale + offset
             inside = float(((made >= low - beyond) & (made <= high + beyond)).mean())
             # what hardly moves then is near everything
-            spread = np.median(np.abs(scale) * (most - least) / (high - low))
+            spread = middle(np.abs(scale) * (most - least) / (high - low))
             if inside >= _INSIDE and spread > _HARDLY:
                 found[which] = max(found.get(which, (0.0, "")), (inside, name))
     if not found:

@@ -20,6 +20,7 @@ from dexkit.conformance.dataset.motion import joints_text, part_text
 from dexkit.conformance.dataset.relation import (
     Relation,
     correlations,
+    middle,
     moments,
     relations,
     shifted,
@@ -115,7 +116,7 @@ def _exchanged(left: Relation, right: Relation) -> str | None:
     correlation = min(c for c, _, _ in crossed)
     lead = min(c - _follows(s) for (s, _), (c, _, _) in zip(there, crossed, strict=True))
     parts_of = [
-        near / max(float(np.median(s.apart[s.state_span > _MOVES * s.stroke])), 1e-9)
+        near / max(middle(s.apart[s.state_span > _MOVES * s.stroke]), 1e-9)
         for (s, _), (_, near, _) in zip(there, crossed, strict=True)
     ]
     nearer = min(parts_of) < _NEARER and max(parts_of) < 1 and lead > _LEAD / 3
@@ -159,7 +160,7 @@ def _crossed(state: Relation, action: Relation) -> tuple[float, float, int]:
             continue
         if (value := float(np.abs(m.cov).sum()) / size) > best:
             best, best_lag = value, lag
-        near = min(near, *(float(np.median(m.apart(sign)[moved])) for sign in (1.0, -1.0)))
+        near = min(near, *(middle(m.apart(sign)[moved]) for sign in (1.0, -1.0)))
     return best, near, best_lag
 
 
@@ -228,7 +229,7 @@ def _order(r: Relation, signs: dict[int, tuple[float, float]]) -> dict[int, int]
     moving = np.minimum(r.state_span, r.action_span) > _MOVES * r.stroke
     if moving.sum() < 2 or r.apart[moving].max() < _APART:
         return {}
-    sure = np.median(r.own[moving]) > _FOLLOWS
+    sure = middle(r.own[moving]) > _FOLLOWS
     best: dict[int, int] = {}
     for lag in [r.lag] if sure else r.lags[::2]:
         found = _exchanged_joints(r, *shifted(r.state, r.action, lag), signs)

@@ -33,7 +33,12 @@ def _clipped(episode: Episode) -> Iterator[Finding]:
         short = _beyond(r)
         if (r.farthest < short).all() or other_units(r) is not None:
             continue
-        found = {j: at for j in range(len(short)) if (at := _cut(r, j, float(short[j])))}
+        # without going beyond an end of its action none can have been cut off there
+        past = np.maximum(
+            r.state.max(axis=0) - r.action.max(axis=0), r.action.min(axis=0) - r.state.min(axis=0)
+        )
+        perhaps = np.flatnonzero(past > short / 4).tolist()
+        found = {j: at for j in perhaps if (at := _cut(r, j, float(short[j])))}
         if not found:
             continue
         joints = sorted(found)

@@ -182,6 +182,8 @@ def _stays_open(r: Relation, low: Floats, high: Floats) -> Mask:
     if not r.track.is_hand:
         return bad
     closing = r.track.closing
+    if closing is None and r.moving.any() and r.own[r.moving].min() > _STRAIGHT:
+        return bad  # it follows, in a unit of its own
     # of a hand that is not known either end may be the open one
     ways = [closing] if closing is not None else [np.ones(len(r.stroke)), -np.ones(len(r.stroke))]
     least, most = _ends(r)

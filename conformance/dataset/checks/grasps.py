@@ -18,7 +18,7 @@ from dexkit.conformance.dataset.checks.assignment import misassigned
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.motion import part_text, runs_of
-from dexkit.conformance.dataset.relation import Relation, relations
+from dexkit.conformance.dataset.relation import Relation, relations, running
 from dexkit.conformance.dataset.unit_fit import other_units
 from dexkit.hand import Floats
 
@@ -37,6 +37,7 @@ _MOVES = 0.04  # strokes that a hand closes on then, at least
 _PART = 0.5  # of what it was short of its action
 _LEFT = 0.25  # of the pressure, or the torque, that is left when nothing is held
 _CLEAR = 6.0  # times the noise, that a pressure is to be one
+_BEST = np.minimum, np.maximum
 _STEADY = 0.02  # strokes that a steady action changes
 
 
@@ -157,10 +158,8 @@ def _steady(
 ) -> NDArray[np.bool_]:
     """Whether the action stays as it is, before, while and for some frames ``after`` it is lost."""
     late = max(0, r.lag) + round(0.3 / r.step)
-    low, high = grip.told[at].copy(), grip.told[at].copy()
-    for shift in range(-wide - late, after + 1):
-        values = grip.told[np.clip(at + shift, 0, len(grip.told) - 1)]
-        low, high = np.minimum(low, values), np.maximum(high, values)
+    told = grip.told[:, None]
+    low, high = (running(told, wide + late, after, best)[at, 0] for best in _BEST)
     return np.asarray(high - low < _STEADY)
 
 
