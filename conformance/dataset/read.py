@@ -13,6 +13,7 @@ from dexkit.errors import SessionError
 from dexkit.hand import Floats
 from dexkit.models import MODELS
 from dexkit.traces.reader import Trace
+from dexkit.traces.sessions.carried import format_of
 from dexkit.traces.sessions.episodes import read_episode
 from dexkit.traces.sessions.imported import MEASURED, import_record
 from dexkit.traces.sessions.lerobot_in import Dataset
@@ -100,7 +101,7 @@ def episode_of_recording(trace: Trace, name: str) -> Episode:
     streams = [s for s in streams_of(trace, keep_samples=False) if len(s) > 1]
     if not streams:
         raise SessionError(f"{trace.path} has no joints of a known hand, robot or session")
-    imported = record.format != "recording" and not record.aligned
+    imported = not format_of(record.format).whole and not record.aligned
     grid = _frames(streams) if imported else _grid(streams)
     touches = {p.part: p for p in pressures_of(trace, streams)}
     found: dict[str, dict[str, Stream]] = {}
@@ -131,7 +132,7 @@ def episode_of_recording(trace: Trace, name: str) -> Episode:
         )
     return Episode(
         name=name,
-        form="recording" if not imported else record.format,
+        form=record.format,
         fps=record.rate_hz if imported else _FASTEST,
         t=(grid - grid[0]) / 1e9,
         tracks=tracks,
