@@ -87,3 +87,12 @@ def test_later_than_the_others(takes: dict[str, Judgement], frames: int, part: s
     [finding] = found["late"]
     assert finding.check == "out-of-step"
     assert finding.part == part
+
+
+def test_an_episode_without_a_camera_that_the_others_have() -> None:
+    judgements = {f"e{i}": Judgement(cameras=["head", "wrist"]) for i in range(6)}
+    judgements["e6"] = Judgement(cameras=["head"])
+    ((name, (finding,)),) = across(judgements).items()
+    assert (name, finding.check, finding.part) == ("e6", "camera-missing", "camera wrist")
+    judgements |= {f"f{i}": Judgement(cameras=["head"]) for i in range(6)}
+    assert not across(judgements)  # two ways to record

@@ -50,6 +50,7 @@ _LABELS = ("robot", "operator", "task", "site")
 """Keys of a recording's metadata, in any of its records, by which an audit groups sessions."""
 _SOME = 5  # of a file's warnings are kept
 _TEXT = 500  # characters of each
+_CUT = "the recording is cut or damaged: messages are lost"
 _MORE_MEMORY = "--set memory=MIB"
 
 
@@ -242,6 +243,8 @@ def _judged(
         with contextlib.suppress(SessionError):
             episode = episode_of_recording(trace, name)
             episode.problems.extend(notes)
+            if trace.truncated or trace.damage:
+                episode.problems.append(_CUT)
             judgement, form = judge_episode(episode), episode.form
         view = recording_of(trace, None, ())
         facts |= _facts_of_recording(view)

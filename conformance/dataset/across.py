@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -27,6 +28,7 @@ OF_SETS = {
 
 _COPY = re.compile(r"copy|dup|\(\d+\)|~", re.IGNORECASE)  # in names that people give to copies
 _LAG = "lag of the "
+_MOST = 0.75  # of the episodes of a set, whose cameras are those of the set
 _EPISODES = 8  # from which a usual lag can be told
 _APART_S = 0.1  # three frames of 30 Hz
 _APART_ALONE_S = 0.35  # of one part alone, which may be slow
@@ -51,6 +53,7 @@ def across(
         for name, finding in (
             *_duplicates(kind),
             *_late(kind),
+            *_lacking(kind),
             *never_moving(kind),
             *grasps_of_set(kind),
             *units_of_set(kind),
@@ -106,6 +109,17 @@ def _duplicates(judgements: Mapping[str, Judgement]) -> Iterator[tuple[str, Find
                 limit=0.03,
             ),
         )
+
+
+def _lacking(judgements: Mapping[str, Judgement]) -> Iterator[tuple[str, Finding]]:
+    """Episodes without a camera that nearly all others have."""
+    count = Counter(camera for j in judgements.values() for camera in j.cameras)
+    for camera, n in count.items():
+        if _MOST * len(judgements) <= n < len(judgements) and n >= _EPISODES // 2:
+            text = f"it has no pictures of {camera}, which {n} of {len(judgements)} episodes have"
+            for name, judgement in judgements.items():
+                if camera not in judgement.cameras:
+                    yield name, Finding("camera-missing", Use.DROP, text, f"camera {camera}")
 
 
 def _late(judgements: Mapping[str, Judgement]) -> Iterator[tuple[str, Finding]]:

@@ -85,6 +85,7 @@ class Judgement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     :param key: digest of the motion; equal for equal data.
     :param shape: the motion in few numbers, to find the same motion in another episode.
     :param kind: digest of its parts, joints and rate; only episodes of one kind are compared.
+    :param cameras: names of those that it has.
     :param sums: by feature of a dataset: lowest, highest, mean and standard deviation of each
         element, and the number of frames.
     """
@@ -98,6 +99,7 @@ class Judgement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     key: str = ""
     shape: list[float] = []
     kind: str = ""
+    cameras: list[str] = []
     sums: dict[str, list[list[float]]] = {}
 
     @property

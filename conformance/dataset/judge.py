@@ -96,6 +96,7 @@ def judge(episode: Episode) -> Judgement:
     result.shots = [s for i in reasons[:1] if (s := _shot(episode, i, findings[i])) is not None]
     result.key, result.shape = _key(episode), shape_of(episode)
     result.kind = _kind(episode)
+    result.cameras = [camera.name for camera in episode.cameras]
     result.sums = metadata.sums_of(episode)
     return result
 

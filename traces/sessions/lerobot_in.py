@@ -48,6 +48,8 @@ _INDEXES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 MOST_FRAMES = 1_000_000
 """Frames of an episode: 9 hours at 30 a second."""
 _MAX_JSON = 256 * 2**20
+# Words in the names of the joints of a hand
+_OF_HANDS = {"hand", "gripper", "thumb", "index", "middle", "ring", "pinky", "little", "finger"}
 # A field of a path: {video_key}, {chunk_index:03d}
 _FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}", re.ASCII)
 
@@ -863,4 +865,4 @@ def _part_of(name: str) -> str:
     side, words = _side(name), _words(name)
     if side is None:
         return "robot"
-    return f"{side}{HAND}" if "hand" in words or "gripper" in words else f"{side}_arm"
+    return f"{side}{HAND}" if _OF_HANDS & set(words) else f"{side}_arm"

@@ -39,6 +39,7 @@ _LOST = (
     "cannot be read",
     "are left out",
     "are too large",
+    "by the list of episodes",
 )
 """Words of the importer's sentences that say that data of joints are lost or in doubt."""
 _PICTURES = ("picture", "video", "camera")
