@@ -99,6 +99,14 @@ def test_lost_frames() -> None:
     assert told.value == pytest.approx(29 / FPS, abs=0.05)
 
 
+def test_lost_observations() -> None:
+    index = np.concatenate([np.arange(204), np.arange(229, 450), np.full(25, 449)])
+    source = episode(9, kind="sine", arm_kind="sine")
+    [finding] = found(changed(source, "", state=lambda x: x[index]), "missing")
+    assert finding.end_s == pytest.approx(204 / FPS, abs=0.05)
+    assert "observations are missing" in finding.text
+
+
 def test_one_lost_frame_is_a_remark() -> None:
     index = np.concatenate([np.arange(200), np.arange(201, 450)])
     judged = judge(_taken(episode(3), index, times=True))

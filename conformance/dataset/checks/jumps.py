@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from dexkit.conformance.dataset.check import Check, Data
+from dexkit.conformance.dataset.checks.frames import leaps
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.motion import (
@@ -34,20 +35,35 @@ _TURN = 2 * np.pi
 
 
 def _jumps(episode: Episode) -> Iterator[Finding]:
-    all_at_once = np.zeros(len(episode), dtype=int)
+    at_once = np.zeros(len(episode), dtype=int)
+    ordered = np.zeros(len(episode), dtype=np.bool_)
+    held = np.ones(len(episode), dtype=np.bool_)
     found: list[tuple[Track, Bools, Bools]] = []
     for track in episode.tracks:
-        state = series_of(track, "state")
+        state, action = series_of(track, "state"), series_of(track, "action")
         if state is None or len(state.q) < 8:
             continue
-        spikes, steps = _leaps(episode, track, state, series_of(track, "action"))
-        all_at_once += (spikes | steps).any(axis=1)
+        spikes, steps = _leaps(episode, track, state, action)
+        at_once += steps.any(axis=1)
+        if steps.any():
+            ordered |= np.zeros_like(ordered) if action is None else leaps(action).any(axis=1)
+            held[1:] &= state.same[:-1].all(axis=1) | ~steps[1:].any(axis=1)
         found.append((track, spikes, steps))
+    together = (at_once > 1) & (at_once == len(found))
     for track, spikes, steps in found:
-        if len(found) > 1:
-            # where every part leaps at once frames are missing, or a stream froze
-            steps = steps & (all_at_once < len(found))[:, None]
-        yield from _findings(episode, track, spikes, steps)
+        # where every part leaps at once something is missing
+        yield from _findings(episode, track, spikes, steps & ~together[:, None])
+    # where the actions leap as well frames are missing, and after a stretch of one value the
+    # stream was frozen: both are told as such
+    for i in np.flatnonzero(together & ~ordered & ~held)[:1].tolist():
+        yield Finding(
+            "missing",
+            Use.DROP,
+            f"observations are missing before {episode.t[i]:.1f} s: those of all parts leap in one "
+            "frame while their actions go on",
+            begin_s=float(episode.t[i - 1]),
+            end_s=float(episode.t[i]),
+        )
     yield from _odd_actions(episode)
 
 

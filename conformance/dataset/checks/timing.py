@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexkit.conformance.dataset.check import Check, Data, Figure
+from dexkit.conformance.dataset.checks.assignment import misassigned
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.motion import (
@@ -181,6 +182,8 @@ def _out_of_step(episode: Episode) -> Iterator[Finding | Figure]:
             step = _absolute(episode, track, lag)
             if step is not None:
                 found.append(step)
+    # a state beside another part's action has no lag
+    found = [s for s in found if not misassigned(episode, s.track.part)]
     drifts = [s for s in found if s.kind == "drift"]
     for step in drifts:
         # one part alone may be held by an object now, and not before
