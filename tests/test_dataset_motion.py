@@ -117,8 +117,10 @@ def test_one_lost_frame_is_a_remark() -> None:
 def test_not_finite() -> None:
     def nan(values: Floats) -> Floats:
         values[50:60] = np.nan
+        values[60:] += 0.3  # what happened meanwhile is no leap
         return values
 
+    assert not found(changed(episode(1), "left_hand", state=nan), "jump")
     [finding] = found(changed(episode(1), "left_hand", state=nan), "missing")
     assert finding.value == 10
     assert finding.part == "left_hand"

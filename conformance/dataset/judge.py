@@ -26,7 +26,7 @@ from dexkit.conformance.dataset.checks import (
     units,
 )
 from dexkit.conformance.dataset.episode import Episode, Track
-from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, Shot, use_of
+from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, Shot, Use, use_of
 from dexkit.conformance.dataset.likeness import shape_of
 from dexkit.conformance.dataset.motion import span
 from dexkit.hand import Floats
@@ -62,6 +62,13 @@ _CAUSES = {
     "clipped": ("frozen", "not-followed"),
 }
 """By check, what follows from what it finds, and is not told again."""
+_SURE_CAUSES = {
+    # a state that is late, or stands still to the last digit, is not where its action is
+    "out-of-step": ("not-followed",),
+    "frozen": ("not-followed",),
+    "repeated": ("frozen",),
+}
+"""Likewise, of findings for which an episode is dropped."""
 _CURVES = 3  # findings of an episode with a picture of the moment
 _POINTS = 160  # of a curve
 _AROUND = 1.0  # s that a curve shows before and after its finding
@@ -102,14 +109,17 @@ def judge(episode: Episode) -> Judgement:
 
 
 def _causes(findings: list[Finding]) -> list[Finding]:
-    """Without what follows from another finding (:data:`_CAUSES`); and a joint or two that leap by
-    a turn are no other unit.
+    """Without what follows from another finding, by :data:`_CAUSES` and :data:`_SURE_CAUSES`; and a
+    joint or two that leap by a turn are no other unit.
     """
     leaps = {f.part for f in findings if f.check == "jump" and 0 < len(f.joints) <= 2}
     findings = [f for f in findings if f.check != "units" or f.part not in leaps]
     parts = {(cause, f.part) for f in findings for cause in _CAUSES if f.check == cause}
     hidden = {(check, part) for cause, part in parts for check in _CAUSES[cause]}
-    return [f for f in findings if (f.check, f.part) not in hidden]
+    sure = [f for f in findings if f.use is Use.DROP and f.check in _SURE_CAUSES]
+    hidden |= {(check, f.part) for f in sure for check in _SURE_CAUSES[f.check]}
+    everywhere = {check for f in sure if not f.part for check in _SURE_CAUSES[f.check]}
+    return [f for f in findings if (f.check, f.part) not in hidden and f.check not in everywhere]
 
 
 def _curve(episode: Episode, number: int, finding: Finding) -> Curve | None:

@@ -136,6 +136,7 @@ def _series_of(track: Track, what: str) -> Series | None:
     both = np.zeros(len(there), dtype=np.bool_)
     both[1:] = there[1:] & there[:-1]
     same = (steps == 0) & both[:, None]
+    steps[~both] = 0
     sizes = np.abs(steps)
     quantum = np.where(sizes > 1e-7, sizes, np.inf).min(axis=0)
     bends = np.abs(steps[2:] - steps[1:-1])

@@ -222,8 +222,8 @@ def _together(found: _Group) -> list[_Group]:
             _, first = group[0]
             if (
                 all(t is not track for t, _ in group)
-                and abs(first.begin - stretch.begin) <= 1
-                and abs(first.end - stretch.end) <= 1
+                and abs(first.begin - stretch.begin) <= 3
+                and abs(first.end - stretch.end) <= 3
             ):
                 group.append((track, stretch))
                 break
@@ -240,6 +240,12 @@ def _companions(track: Track, stretch: _Stretch) -> list[int]:
     return sorted({*stretch.joints, *np.flatnonzero(still).tolist()})
 
 
+def _stands(track: Track, begin: int, end: int) -> bool:
+    """Whether all joints of a part stand still, evidence or not."""
+    state = series_of(track, "state")
+    return state is not None and float(state.same[begin + 1 : end].mean()) > 0.95
+
+
 def _finding(episode: Episode, group: _Group) -> Finding:
     stretches = [s for _, s in group]
     worst = max(stretches, key=lambda s: s.moved)
@@ -247,7 +253,7 @@ def _finding(episode: Episode, group: _Group) -> Finding:
     begin_s = float(episode.t[begin])
     end_s = float(episode.t[min(end, len(episode.t)) - 1])
     observed = [t for t in episode.tracks if t.state is not None]
-    everything = len(group) == len(observed) > 1
+    everything = len(observed) > 1 and all(_stands(t, begin, end) for t in observed)
     joints: tuple[int, ...]
     if everything:
         what, part, joints = "all parts", "", ()
