@@ -294,6 +294,7 @@ GOOD: dict[str, Episode] = {
     "object": episode(27, plant=Plant(block=0.45)),
     "object, simulated": episode(28, plant=Plant(block=0.45, noise=0.0), kind="trigger"),
     "slow registers": episode(29, hand="inspire-ftp", plant=Plant(delay_s=0.35, renew_s=0.12)),
+    "behind a slow bridge": episode(41, plant=Plant(delay_s=0.37, tau_s=0.1)),
     "simulated": episode(30, plant=Plant(noise=0.0), arm_plant=Plant(noise=0.0)),
     "sag": episode(31, arm_plant=Plant(sag=0.05)),
     "quick": episode(32, pace=2.5),

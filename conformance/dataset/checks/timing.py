@@ -31,7 +31,9 @@ _SURE = 0.7  # correlation from which a delay is believed
 _FIRM = 0.8  # from which it is a reason: the other hand's action may be like it by 0.78
 _SHARP = 0.9  # and from which it is compared with that of other episodes
 _LATEST_HAND_S = 0.7  # Inspire's hands on a G1 are 0.4 s behind, with values up to 0.13 s old
-_LATEST_QUICK_S = 0.5  # hands with 200 states a second: 0.15 s, slow ones 0.3 s
+_LATEST_QUICK_S = (
+    0.6  # hands with 200 states a second: 0.15 s; with a slow bridge before them 0.5 s
+)
 _QUICK_HZ = 150.0
 _LATEST_ARM_S = 0.4  # arms that swing are 0.2 s behind
 _EARLY_FRAMES = 2.5  # that a state may be before its action: the next state is the action
