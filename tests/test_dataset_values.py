@@ -298,6 +298,8 @@ def test_statistics_are_compared() -> None:
 
 def test_what_could_not_be_read_is_told() -> None:
     lost = "the file is cut or damaged; it is read up to its last whole item"
+    body = "body: states have 15 joints and actions 3; they are kept as two groups"
+    assert blamed(replace(made(), problems=[body])) == []  # speeds of the legs
     harmless = "left_hand may be one of inspire-dfx, inspire-ftp; it is kept as a group of joints"
     assert only(replace(made(), problems=[lost]), "readable").text == lost
     judged = judge(replace(made(), problems=[harmless]))
