@@ -178,6 +178,30 @@ def test_a_camera_that_does_not_see_the_arm_that_moves_is_good(tmp_path: Path) -
     assert reasons(episode) == []
 
 
+def test_a_camera_on_an_arm_that_rests_is_good(tmp_path: Path) -> None:
+    """Without noise its picture is still then, whatever the fingers do out of its view."""
+    q = reaches(10, FPS)
+    q[3 * FPS : 6 * FPS] = q[3 * FPS]
+    rng = np.random.default_rng(0)
+    world = np.kron(rng.integers(0, 255, (6, 40)), np.ones((10, 10))).astype(np.uint8)
+    pictures = [world[:, x : x + SIZE[1]] for x in np.round(150 + 60 * q).astype(int).tolist()]
+    write_video(tmp_path / "v.mp4", pictures)
+    episode = episode_with(tmp_path, q)
+    fingers = 0.5 + 0.5 * np.sin(np.arange(len(q)) / 7)
+    episode.tracks.append(Track("right_hand", ("index",), state=fingers[:, None]))
+    assert reasons(episode) == []
+
+
+@each("noise", (0.0, 4.0))
+def test_a_camera_that_sees_one_arm_of_two_is_good(tmp_path: Path, noise: float) -> None:
+    """The other arm may do the same a second before, and the name may be that of the other."""
+    seen = reaches(10, FPS)
+    write_video(tmp_path / "cam_left_wrist.mp4", scene(seen, noise))
+    episode = episode_with(tmp_path, seen, videos=("cam_left_wrist.mp4",))
+    episode.tracks.append(Track("left_arm", ("elbow",), state=reaches(10, FPS, -1.0)[:, None]))
+    assert reasons(episode) == []
+
+
 @each("fps", (10, 15, 40))
 def test_a_camera_may_have_another_rate(tmp_path: Path, fps: int) -> None:
     write_video(tmp_path / "v.mp4", scene(reaches(10, fps)), fps)
@@ -400,6 +424,22 @@ def test_a_frozen_stretch_is_found(
     assert found.end_s == pytest.approx(stretch[1], abs=0.5)
 
 
+@each("codec", CODECS)
+@each("noise", (6.0, 10.0))
+def test_a_noisy_picture_that_freezes_is_found(
+    tmp_path: Path, codec: tuple[str, dict[str, str]], noise: float
+) -> None:
+    """To the end: so it leaps nowhere, and a codec may show noise that froze better and better."""
+    q = reaches(10, FPS)
+    pictures = scene(q, noise)
+    begin = 4 * FPS
+    pictures[begin:] = [pictures[begin]] * (len(pictures) - begin)
+    write_video(tmp_path / "v.mp4", pictures, codec=codec)
+    found = only(episode_with(tmp_path, q))
+    assert (found.check, found.use, found.part) == ("camera-frozen", Use.DROP, "camera v")
+    assert found.begin_s == pytest.approx(4.0, abs=2.0)
+
+
 @each(
     "name",
     {
@@ -448,18 +488,20 @@ def dict_of(found: Iterable[tuple[str, Finding]]) -> dict[str, list[Finding]]:
 
 
 @each("lag", (-0.5, 0.7, 1.0))
-def test_a_late_picture_is_found(tmp_path: Path, lag: float) -> None:
+@each("noise", (1.0, 8.0))
+def test_a_late_picture_is_found(tmp_path: Path, lag: float, noise: float) -> None:
     q = reaches(10, FPS)
-    write_video(tmp_path / "v.mp4", scene(reaches(10, FPS, lag)))
+    write_video(tmp_path / "v.mp4", scene(reaches(10, FPS, lag), noise))
     found = only(episode_with(tmp_path, q))
     assert (found.check, found.use) == ("camera-late", Use.REVIEW)
     assert found.value == pytest.approx(lag, abs=0.1)
 
 
-def test_a_drifting_picture_is_found(tmp_path: Path) -> None:
+@each("noise", (1.0, 8.0))
+def test_a_drifting_picture_is_found(tmp_path: Path, noise: float) -> None:
     q = reaches(10, FPS)
     slow = np.interp(np.arange(len(q)) * 0.9, np.arange(len(q)), q)
-    write_video(tmp_path / "v.mp4", scene(slow))
+    write_video(tmp_path / "v.mp4", scene(slow, noise))
     found = only(episode_with(tmp_path, q))
     assert found.check == "camera-late"
     assert "drifts" in found.text

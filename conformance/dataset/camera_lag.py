@@ -14,22 +14,25 @@ from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.motion import stroke
 from dexkit.hand import Floats
 
-__all__ = ["DRIFT", "Lag", "Motion", "motion_of"]
+__all__ = ["DRIFT", "LATENCY", "Lag", "Motion", "motion_of"]
 
 Lags = NDArray[np.int_]
 
 DRIFT = 0.25
 """Seconds between start and end from which on a picture drifts."""
+LATENCY = 0.35
+"""Seconds that a camera and its network, or the joints and theirs, may take."""
 _ON_ARMS = frozenset({"wrist", "hand", "arm", "gripper", "ee"})
 _DEAD = 0.01  # of a joint's stroke, which noise of the encoder may be
 _STEP = 0.05  # s between values of speed that are compared
+_AVERAGED = 0.15  # s of pictures before and after a time
 _SMOOTH = 3  # of them, over which joints and picture are smoothed alike
 _LATEST = 2.0  # s that are looked at
 _CLEAR, _CLEARER = 0.6, 0.12  # correlation of a clear peak, and how much better than elsewhere
 _ELSEWHERE = 0.4  # s from a peak
 _LEAST_LENGTH = 6.0  # s of an episode; in a shorter one anything may correlate
 _EACH_THIRD = 0.3  # correlation in each third of the episode
-_BETTER = 0.08  # than the best lag without drift; a picture in step gains a third of that
+_BETTER = 0.12  # correlation, than in step; what fits by chance gains two thirds of that
 _CLEAR_DRIFT = 0.7  # correlation with the best drift
 _IN_STEP = 0.5  # s
 _DRIFTS: Floats = 0.2 * np.arange(-20, 21, dtype=np.float64)  # s from start to end that are tried
@@ -162,27 +165,53 @@ class Lag:
         if end < _LEAST_LENGTH:
             return None
         times: Floats = np.arange(0.0, end, _STEP, dtype=np.float64)
-        between = (track.t[1:] + track.t[:-1]) / 2
-        seen = _speed(times, between, track.changes[1:])
-        speeds = motion.speed
-        signals = [speeds.sum(axis=1)]
-        if np.count_nonzero(speeds.any(axis=0)) > 1:
-            signals += [s for s in speeds.T if s.any()]  # a camera may see one arm only
+        seen = _seen(track, times)
+        signals, arms = _signals(motion)
+        if not len(signals):
+            return None
+        moved = np.stack([_speed(times, motion.t, signal) for signal in signals])
         # the picture put right by each drift, and then by the lag that is left
         put_right = np.stack(
             [np.interp(times + drift * (times / times[-1] - 0.5), times, seen) for drift in _DRIFTS]
         )
         most = round(_LATEST / _STEP)
         lags = np.arange(-most, most + 1)
-        best: tuple[float, Floats, Floats] | None = None
-        for signal in signals:
-            moved = _speed(times, motion.t, signal)
-            curves = _correlations(put_right, moved, lags)
-            if best is None or curves.max() > best[0] + 0.02:
-                best = float(curves.max()), moved, curves
-        assert best is not None
-        _, moved, curves = best
-        return _judged(times, seen, moved, curves, lags)
+        return _judged(times, seen, moved, arms, _correlations(put_right, moved, lags), lags)
+
+
+def _seen(track: CameraTrack, times: Floats) -> Floats:
+    """How fast a picture changes, by what is seen before and after each time.
+
+    Pictures are averaged and what their noise changes is taken off: from one picture to the next a
+    sensor's noise and a codec's key frames may change more than what moves.
+    """
+    flat = track.thumbs.reshape(len(track), -1).astype(np.float64)
+    sums = np.concatenate([np.zeros_like(flat[:1]), np.cumsum(flat, axis=0)])
+    width = max(_AVERAGED, 1.5 * float(np.median(np.diff(track.t))))
+
+    def mean(begin: Floats, end: Floats) -> Floats:
+        first = np.minimum(np.searchsorted(track.t, begin - 1e-6), len(track) - 1)
+        last = np.maximum(np.searchsorted(track.t, end - 1e-6), first + 1)
+        return np.asarray((sums[last] - sums[first]) / (last - first)[:, None])
+
+    steps = np.abs(mean(times, times + width) - mean(times - width, times))
+    low = len(times) // 5
+    noise = 2 * np.partition(steps, low, axis=0)[low]
+    return _smooth(np.sqrt(np.maximum(steps - noise, 0.0).sum(axis=1))[:, None], _SMOOTH)[:, 0]
+
+
+def _signals(motion: Motion) -> tuple[list[Floats], NDArray[np.bool_]]:
+    """Speeds of what a camera may see, and which of them hold an arm that moves, if any does.
+
+    That is all parts together, those of a side, or one: it may see one arm only, whatever its name.
+    """
+    speeds = motion.speed
+    moving = [i for i in range(len(motion.parts)) if speeds[:, i].any()]
+    groups = [moving, *([i] for i in moving)]
+    groups += [[i for i in moving if motion.parts[i].startswith(s)] for s in ("left", "right")]
+    groups = [g for i, g in enumerate(groups) if g and g not in groups[:i]]
+    arms = [any(motion.parts[i].endswith("arm") for i in group) for group in groups]
+    return [speeds[:, group].sum(axis=1) for group in groups], np.array(arms) | (not any(arms))
 
 
 def _speed(times: Floats, t: Floats, values: Floats) -> Floats:
@@ -190,23 +219,35 @@ def _speed(times: Floats, t: Floats, values: Floats) -> Floats:
     return _smooth(np.sqrt(np.interp(times, t, values))[:, None], _SMOOTH)[:, 0]
 
 
-def _judged(times: Floats, seen: Floats, moved: Floats, curves: Floats, lags: Lags) -> Lag:
-    """:param curves: correlations, shape (drifts, lags)."""
-    steady = curves[len(_DRIFTS) // 2]
-    constant, clear = _peak(steady, lags)
-    row, column = np.unravel_index(int(np.argmax(curves)), curves.shape)
-    drift, lag = float(_DRIFTS[row]), float(lags[column]) * _STEP
-    begin, end = lag - drift / 2, lag + drift / 2
-    best = float(curves[row, column])
-    drifts = (
-        abs(drift) >= DRIFT
-        # a stream is in step where it is begun, or where it is cut
-        and min(abs(begin), abs(end)) <= _IN_STEP
-        and best >= max(_CLEAR_DRIFT, float(steady.max()) + _BETTER)
-        and _fits_throughout(times, seen, moved, begin, end)
-    )
-    clear = clear and not drifts and _fits_throughout(times, seen, moved, constant, constant)
-    return Lag(constant, begin, end, clear, drifts)
+def _judged(
+    times: Floats, seen: Floats, moved: Floats, arms: NDArray[np.bool_], curves: Floats, lags: Lags
+) -> Lag:
+    """:param curves: correlations, shape (signals, drifts, lags).
+
+    Of many lags and parts one fits by chance: so a picture is late only where it fits much better
+    than in step with whatever moves.
+    """
+    begin = lags * _STEP - _DRIFTS[:, None] / 2
+    end = lags * _STEP + _DRIFTS[:, None] / 2
+    in_step = float(curves[:, (np.abs(begin) <= LATENCY) & (np.abs(end) <= LATENCY)].max())
+
+    steady = curves[:, len(_DRIFTS) // 2]
+    which = int(np.argmax(steady.max(axis=1) - (~arms)))
+    constant, clear = _peak(steady[which], lags)
+    if abs(constant) > LATENCY:
+        clear = steady[which].max() >= max(_CLEAR, in_step + _BETTER)
+
+    # a stream is in step where it is begun, or where it is cut
+    possible = (np.abs(end - begin) >= DRIFT) & (np.minimum(np.abs(begin), np.abs(end)) <= _IN_STEP)
+    fits = np.where(possible & arms[:, None, None], curves, -1.0)
+    signal, row, column = np.unravel_index(int(np.argmax(fits)), fits.shape)
+    first, last = float(begin[row, column]), float(end[row, column])
+    others = max(in_step, float(steady.max()))
+    drifts = bool(
+        fits[signal, row, column] >= max(_CLEAR_DRIFT, others + _BETTER)
+    ) and _fits_throughout(times, seen, moved[signal], first, last)
+    clear = clear and not drifts and _fits_throughout(times, seen, moved[which], constant, constant)
+    return Lag(constant, first, last, bool(clear), drifts)
 
 
 def _fits_throughout(times: Floats, seen: Floats, moved: Floats, begin: float, end: float) -> bool:
@@ -226,22 +267,22 @@ def _correlations(seen: Floats, moved: Floats, lags: Lags) -> Floats:
     """Correlation of pictures, put earlier by each lag, with the joints.
 
     :param seen: shape (pictures, times).
-    :returns: shape (pictures, lags).
+    :param moved: shape (signals, times).
+    :returns: shape (signals, pictures, lags).
     """
     n = seen.shape[1]
-    a, b = seen - seen.mean(axis=1, keepdims=True), moved - moved.mean()
     size = 1 << (2 * n - 1).bit_length()
-    products = np.fft.irfft(np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size)), size)
+    a, b = (x - x.mean(axis=1, keepdims=True) for x in (seen, moved))
+    spectrum, others = np.fft.rfft(a, size), np.conj(np.fft.rfft(b, size))
+    products = np.stack([np.fft.irfft(spectrum * o, size)[:, lags % size] for o in others])
     # of the times that both have at a lag
     power_a = np.cumsum(np.pad(a * a, ((0, 0), (1, 0))), axis=1)
-    power_b = np.cumsum(np.pad(b * b, (1, 0)))
+    power_b = np.cumsum(np.pad(b * b, ((0, 0), (1, 0))), axis=1)
     of_a = power_a[:, np.minimum(n, n + lags)] - power_a[:, np.maximum(0, lags)]
-    of_b = power_b[np.minimum(n, n - lags)] - power_b[np.maximum(0, -lags)]
-    power = of_a * of_b
+    of_b = power_b[:, np.minimum(n, n - lags)] - power_b[:, np.maximum(0, -lags)]
+    power = of_a * of_b[:, None]
     enough = (np.abs(lags) < n // 2) & (power > 0)
-    return np.asarray(
-        np.where(enough, products[:, lags % size] / np.sqrt(np.where(enough, power, 1.0)), 0.0)
-    )
+    return np.asarray(np.where(enough, products / np.sqrt(np.where(enough, power, 1.0)), 0.0))
 
 
 def _peak(curve: Floats, lags: Lags) -> tuple[float, bool]:

@@ -2,8 +2,8 @@
 
 What a camera saw is compared with how the joints moved in the same time. A camera may see nothing
 that moves, an arm may be out of its view, and a still scene may be identical after decoding: so a
-stretch counts as frozen only where the same camera answers to such motion elsewhere in the episode
-and the picture leaps where the stretch ends, or where its own noise stops.
+stretch counts as frozen only where the camera's own noise stops, or where the same camera answers
+to such motion elsewhere in the episode and the picture leaps where the stretch ends.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dexkit.conformance.dataset.camera_lag import DRIFT, Lag, Motion, motion_of
+from dexkit.conformance.dataset.camera_lag import DRIFT, LATENCY, Lag, Motion, motion_of
 from dexkit.conformance.dataset.cameras import CameraTrack, tracks_of
 from dexkit.conformance.dataset.check import Check, Data, Figure
 from dexkit.conformance.dataset.episode import Episode
@@ -54,15 +54,11 @@ _LEAST_COMPARABLE = 6  # of such windows: 1.5 s
 _LEAST_SEEN = 4  # windows of a stretch, each with such company elsewhere
 _LEAST_LEAP = 0.3  # levels on average: a block in a hundred changes by 30
 _ALL_NOISE = 0.3  # share of pixels that change in every picture, also where little moves
-_LEAST_REST = 1.5  # s at rest, to know the noise by
-_LEAST_ALIVE = 0.25  # of the pictures in it that show noise: a codec with key frames has a tenth
-_LEAST_RESTS = 8  # pictures to compare with
-_FAR = 1.8  # times the largest step after it, or at such a speed of the joints
-_LEAP = 1.5  # times the step after it, by which a frozen picture leaps when it goes on
+_LEAST_REST = 1.0  # s at rest, to know the noise by
+_SHOW_NOISE = 0.3  # of the pictures, at least, that do: those that differ by a key frame are fewer
+_GONE = 0.1  # of the noise: a sensor's does not change so much within an episode
+_FAR = 1.8  # times the largest step after it, by which a frozen picture leaps when it goes on
 _NOISE = 0.05  # share of pixels that noise changes from picture to picture
-
-# camera-late
-_LATENCY = 0.3  # s that a camera and its network may take
 
 
 def _part(track: CameraTrack) -> str:
@@ -262,12 +258,9 @@ def _is_frozen(track: CameraTrack, motion: Motion, begin: int, end: int) -> bool
         return False  # a live picture of a still scene
     if _noise_stops(track, motion, begin, end):
         return True
-    leap = _leap(track, end)
-    if leap is not None and _is_unexplained(track, motion, leap):
-        return True
     # what moves may leave the view; then the picture shows it no more
     ends = track.t[-1] - track.t[end - 1] < _REFRESH
-    goes_on = _shows_something(track, begin, end) if ends else _is_far(track, leap)
+    goes_on = _shows_something(track, begin, end) if ends else _leaps(track, end)
     return goes_on and _would_answer(track, motion, begin, end)
 
 
@@ -283,22 +276,40 @@ def _noise_stops(track: CameraTrack, motion: Motion, begin: int, end: int) -> bo
     """Whether a sensor's noise, which changes pictures even where nothing moves, is gone."""
     period = float(np.median(np.diff(track.t)))
     width = max(2, round(_REFRESH / period))
-    inside = track.altered[begin + 1 + width // 2 : end]  # coding may end what it had begun
-    if len(track) < 4 * width or inside.max(initial=0.0) > _NOISE / 5:
+    if end - begin <= width or len(track) < 4 * width:
         return False
-    outside = np.concatenate([track.altered[1:begin], track.altered[end + 1 :]])
-    if len(outside) >= 4 * width and np.quantile(outside, 0.02) > _ALL_NOISE:
-        return True
-    # the codec may leave noise out of most pictures, and has it in some of each half second
-    alive = sliding_window_view(track.altered[1:], width).max(axis=1)
-    starts, ends = track.t[: len(alive)], track.t[width : width + len(alive)]
-    rests = motion.travel(starts, ends).sum(axis=1) < _MOVES / 2
-    elsewhere = (np.arange(len(alive)) + width < begin) | (np.arange(len(alive)) >= end)
-    rests &= elsewhere
-    if rests.sum() * period < _LEAST_REST or np.quantile(alive[rests], 0.05) <= _NOISE:
+    # a key frame changes a frozen picture too, and a codec leaves noise out of many pictures
+    altered = sliding_window_view(track.altered[1:], width)
+    at = round((1 - _SHOW_NOISE) * (width - 1))
+    alive = np.partition(altered, at, axis=1)[:, at]
+    first = np.arange(len(alive))
+    moved = motion.travel(track.t[first], track.t[first + width])
+    within = (first >= begin) & (first + width < end)
+    # without any noise where it is not: a codec may need a while to show a still picture so
+    low, high = _longest(within & (alive <= _GONE * alive.max()))
+    if high == low:
         return False
-    # not only key frames, which differ without any noise
-    return bool(np.mean(track.altered[1 : len(alive) + 1][rests] > _NOISE) > _LEAST_ALIVE)
+    outside = (first + width < low) | (first >= high - 1 + width)
+    # what moves changes pictures too: more of their pixels than noise does, if it is in view
+    rests = outside & (moved.sum(axis=1) < _MOVES / 2)
+    calm = outside & (moved <= 1.5 * moved[low:high].max(axis=0) + _MOVES / 4).all(axis=1)
+    noise = 0.0
+    for where, least in ((rests, _NOISE), (calm, _ALL_NOISE)):
+        if where.sum() * period >= _LEAST_REST:
+            lowest, usual = np.quantile(alive[where], [0.02, 0.25]).tolist()
+            # the lowest may be of the time in which a codec showed the still picture better
+            if usual > least and lowest > 2 * _GONE * usual:
+                noise = max(noise, usual)
+    low, high = _longest(within & (alive <= _GONE * noise))
+    if high == low or not noise:
+        return False
+    since, until = float(track.t[low + width - at]), float(track.t[high - 1 + at])
+    return until - since >= _LEAST and _path(motion, since, until).sum() >= _LEAST_MOTION
+
+
+def _longest(mask: Mask) -> tuple[int, int]:
+    """Begin and end (exclusive) of the longest run."""
+    return max(runs_of(mask), key=lambda run: run[1] - run[0], default=(0, 0))
 
 
 def _windows(track: CameraTrack, motion: Motion) -> tuple[Floats, Floats, Floats]:
@@ -344,40 +355,17 @@ def _steps(track: CameraTrack) -> Floats:
     return found
 
 
-def _leap(track: CameraTrack, end: int) -> int | None:
-    """The picture that is far from a still stretch before it, further than the next ones from each
-    other: the stream goes on elsewhere. None where the picture begins to move as anything does.
+def _leaps(track: CameraTrack, end: int) -> bool:
+    """Whether a still stretch ends with a picture that is far from it, much further than the next
+    ones are from each other: the stream goes on elsewhere, and does not begin to move.
     """
     steps = _steps(track)
     if end >= len(track):
-        return None
+        return False
     # coding may change the still picture once more before
     at = end + int(np.argmax(steps[end : end + 4]))
     after = steps[at + 1 : at + 7]
-    far = (
-        len(after) >= 3 and steps[at] >= _LEAST_LEAP and steps[at] > _LEAP * after.max(initial=0.0)
-    )
-    return at if far else None
-
-
-def _is_far(track: CameraTrack, leap: int | None) -> bool:
-    """Whether a leap is far larger than the steps that follow it."""
-    steps = _steps(track)
-    return leap is not None and bool(steps[leap] > _FAR * steps[leap + 1 : leap + 7].max())
-
-
-def _is_unexplained(track: CameraTrack, motion: Motion, at: int) -> bool:
-    """Whether a picture is further from the one before than any other one where the joints are
-    hardly faster.
-    """
-    steps = _steps(track)
-    before = np.concatenate([track.t[:1], track.t[:-1]])
-    way = np.interp((track.t + before) / 2, motion.t, motion.speed.sum(axis=1))
-    way *= track.t - before
-    others = np.ones(len(track), bool)
-    others[[0, at]] = False
-    others &= way <= 1.5 * way[at] + _MOVES / 4
-    return int(others.sum()) >= _LEAST_RESTS and bool(steps[at] > _FAR * steps[others].max())
+    return bool(len(after) >= 3 and steps[at] >= max(_LEAST_LEAP, _FAR * after.max()))
 
 
 def _shows_something(track: CameraTrack, begin: int, end: int) -> bool:
@@ -410,10 +398,10 @@ def late(track: CameraTrack, found: Lag | None) -> Iterator[Finding | Figure]:
         )
         drift = abs(found.end - found.begin)
         yield Finding("camera-late", Use.REVIEW, text, part, value=drift, limit=DRIFT, unit="s")
-    elif found.clear and not -_LATENCY / 2 <= found.constant <= _LATENCY:
+    elif found.clear and abs(found.constant) > LATENCY:
         text = f"its picture is {_by(found.constant)}, from start to end"
         yield Finding(
-            "camera-late", Use.REVIEW, text, part, value=found.constant, limit=_LATENCY, unit="s"
+            "camera-late", Use.REVIEW, text, part, value=found.constant, limit=LATENCY, unit="s"
         )
 
 
