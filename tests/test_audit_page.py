@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from dexkit.conformance.audit.records import EpisodeRecord, State
 from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, Shot, Use
-from dexkit.conformance.dataset.judge import CHECKS
+from dexkit.conformance.dataset.judge import CHECKS, TITLES
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -99,3 +100,8 @@ def test_page_of_many_bad_episodes_stays_small() -> None:
     assert "400 episodes" in text
     assert "200 episodes more" in text
     assert len(text) < 3_000_000
+
+
+def test_every_check_is_described() -> None:
+    text = (Path(__file__).parent.parent / "docs/audit.md").read_text()
+    assert [name for name in TITLES if f"`{name}`" not in text] == []

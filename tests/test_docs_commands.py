@@ -49,6 +49,7 @@ def test_every_dexkit_command_in_the_documents_is_accepted(
     for command in shown:
         for name in command.words:
             if Path(name).suffix in (".mcap", ".json", ".toml", ".zip", ".pub", ".html"):
+                Path(name).parent.mkdir(parents=True, exist_ok=True)
                 Path(name).touch()  # what a reader has
         try:
             _parse(command.words)
