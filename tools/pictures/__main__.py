@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 import tempfile
 import threading
@@ -14,6 +15,7 @@ from pathlib import Path
 from PIL import Image
 
 from dexkit.cli.view import recorded
+from dexkit.conformance.audit.audit import Audit, in_this_process
 from dexkit.conformance.report.curves import page as curves_page
 from dexkit.conformance.report.curves import recorded as curves_of
 from dexkit.threads import Worker
@@ -21,6 +23,7 @@ from dexkit.traces import open_trace, sample_path
 from dexkit.view.browser_page import Page
 from tools.browser import Browser, chromium
 from tools.pictures.terminal import monitor_picture
+from tools.spoiled_sets.author_e import write_all
 
 IMAGES = Path(__file__).parent.parent.parent / "docs" / "images"
 _SETTLE = 0.8  # seconds in which a page takes what it was sent
@@ -95,6 +98,15 @@ def pictures(only: Sequence[str]) -> None:
                 browser.open(path.as_uri())
                 browser.wait("document.querySelectorAll('svg').length > 3")
                 save(browser.picture(), "info")
+        if asked("audit"):
+            page = audited(folder)
+            for name, width, height in (("audit", 1100, 1500), ("audit-phone", 400, 1500)):
+                with Browser(folder / name, width, height) as browser:
+                    browser.open(page.as_uri())
+                    browser.wait("document.querySelectorAll('.moment svg').length > 0")
+                    if name == "audit-phone":
+                        browser.run("document.querySelector('#worst').scrollIntoView()")
+                    save(browser.picture(), name)
         if asked("monitor"):
             path = folder / "monitor.html"
             path.write_text(monitor_picture(sample_path("dex3_pinch"), 12.2, 100, 30))
@@ -102,6 +114,19 @@ def pictures(only: Sequence[str]) -> None:
                 browser.open(path.as_uri())
                 browser.wait("document.querySelector('pre') !== null")
                 save(browser.picture(), "monitor")
+
+
+def audited(folder: Path) -> Path:
+    """The page of an audit of three sets with known faults."""
+    sets = folder / "sets"
+    write_all(sets)
+    before = Path.cwd()
+    os.chdir(sets)  # so that names on the page are short
+    try:
+        Audit(["pick_dex1", "toast_dex3", "xr_dex3"], folder / "audit").run(in_this_process)
+    finally:
+        os.chdir(before)
+    return folder / "audit/summary.html"
 
 
 def save(png: bytes, name: str) -> None:
