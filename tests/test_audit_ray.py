@@ -11,12 +11,12 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from dexkit.conformance.audit.audit import Audit, AuditProgress, Limits, in_this_process
 from dexkit.conformance.audit.cluster import Cluster as RayCluster
