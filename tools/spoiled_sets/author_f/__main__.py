@@ -46,16 +46,25 @@ def _write(out: Path, plan: Plan, library: Library) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Write all sets and ``labels.json`` into the folder named on the command line."""
-    out = Path(sys.argv[1])
-    out.mkdir(parents=True)
-    labels = []
+    """Write all sets and ``labels.json`` into the folder named on the command line.
+
+    With names of sets behind it, those alone, into a folder that may have others.
+    """
+    out, wanted = Path(sys.argv[1]), sys.argv[2:]
+    out.mkdir(parents=True, exist_ok=bool(wanted))
+    file = out / "labels.json"
+    known: list[dict[str, Any]] = json.loads(file.read_text()) if file.exists() else []
+    labels: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as work:
         library = Library(Path(work))
         for plan in PLANS:
-            labels += _write(out, plan, library)
-        labels += write_wire(out, Path(work))
-    (out / "labels.json").write_text(json.dumps(labels, indent=1))
+            if plan.folder in wanted or not wanted:
+                labels += _write(out, plan, library)
+            else:
+                labels += [row for row in known if row["dataset"] == plan.folder]
+        if "wire" in wanted or not wanted:
+            labels += write_wire(out, Path(work))
+    file.write_text(json.dumps(labels, indent=1))
     good = sum(label["expect"] == "good" for label in labels)
     print(f"{len(labels)} episodes, {good} good, {len(labels) - good} spoiled")
 

@@ -242,6 +242,8 @@ def _jump(e: Episode, s: Spec, rng: np.random.Generator) -> None:
 
 def _wrong_unit(e: Episode, s: Spec, rng: np.random.Generator) -> None:
     names = _chosen(e, s)
+    if s.variant == "degrees" and HANDS[s.plan.hand].high[0] == 1.0:
+        names = [n for n in names if n.endswith("arm")]  # the hands have no angles
     columns = ("action", "state") if s.variant in ("degrees", "percent", "unit") else ("state",)
     for name in names:
         p = e.parts[name]
@@ -414,8 +416,12 @@ def _drop(e: Episode, s: Spec, rng: np.random.Generator) -> None:
     if last - first < 0.8 * e.rate:
         raise ValueError(f"{s.plan.folder}: nothing is held in a drop: {first} {last}")
     at = first + int((0.35 if s.plain else 0.5) * (last - first))
+    pushed = np.abs(p.effort).max(axis=1)
+    last = min(last, len(e) - 1)
+    while last < len(e) - 1 and pushed[last] > 0.3 * pushed[at]:
+        last += 1  # until the object would have been let go
     t = np.arange(len(e)) / e.rate
-    gone = smooth((t - t[at]) / 0.35) * (1 - smooth((t - t[last]) / 0.3 + 1))
+    gone = smooth((t - t[at]) / 0.35) * (1 - smooth((t - t[last]) / 0.3))
     if s.plan.hand == "dex1":  # the goal of the client is its state less 0.18 rad
         fall = np.clip((t - t[at]) * 6.0, 0, None)
         state = np.maximum(p.state[:, 0] - fall, 0)

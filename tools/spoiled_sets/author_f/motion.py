@@ -144,7 +144,7 @@ class Part:
     state: Floats
     velocity: Floats
     effort: Floats
-    pressure: Floats
+    pressure: NDArray[Any]
 
     def rows(self, index: Any) -> Part:
         """These rows."""
@@ -258,6 +258,7 @@ class Library:
         pace: float,
         spread: float,
         scale: tuple[float, float],
+        touch: bool,
     ) -> Part:
         """A hand's motion at 100 Hz, of pieces of clips, crossfaded."""
         known = HANDS[hand]
@@ -287,6 +288,8 @@ class Library:
         made.velocity = _velocity(made.state)
         if not made.effort.shape[1]:
             made.effort = np.zeros_like(made.state)
+        if not touch:
+            made.pressure = made.pressure[:, :0]
         return mirrored(made, hand) if side == "right" else made
 
     @staticmethod
@@ -469,6 +472,7 @@ def make(plan: Plan, library: Library, number: int, entry: str) -> Episode:
             pace,
             0.0 if plan.hand == "dex3" and plan.grasp else plan.spread,
             (0.4, 0.5) if half else scale,
+            "pressure" in plan.carries,
         )
         tracks[f"{side}_hand"] = track
     if "both" in mood:
@@ -617,6 +621,7 @@ def _frames(
     for name, p in tracks.items():
         now = p.rows(low).mixed(at - low, p.rows(low + 1))
         now.action = p.action[low]
+        now.pressure = now.pressure.astype(np.float32)
         arm = name.endswith("arm")
         noise = (0.0006 if arm else hand.noise) * mood.get("noise", 1.0)
         if "noise" in mood and not arm and hand.high[0] == 1.0:

@@ -120,7 +120,7 @@ PLANS = (
         good ordinary
         wrong_unit right_hand plain percent_state
         good slow_hand
-        wrong_joint_order left_hand plain fingers
+        wrong_joint_order left_hand moderate fingers
         good joint_unused
         frozen_joint left_hand moderate
         good both_same

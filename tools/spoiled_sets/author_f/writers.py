@@ -6,7 +6,7 @@ import importlib
 import io
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,29 +39,29 @@ FIELDS = {
 }
 
 
-def pictures(e: Episode, rows: Rows, seed: int) -> NDArray[np.uint8]:
+def pictures(e: Episode, rows: Rows, seed: int) -> Iterator[NDArray[np.uint8]]:
     """What a camera shows: a bench, two grippers that move with the arms, noise of the sensor."""
     rng = np.random.default_rng(seed)
     coarse = rng.integers(60, 190, (6, 8, 3), dtype=np.uint8)
     bench = np.asarray(Image.fromarray(coarse).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC))
-    noise = rng.normal(0, 2.5, (16, HEIGHT, WIDTH, 1))
-    frames = np.empty((len(rows), HEIGHT, WIDTH, 3), dtype=np.uint8)
-    for k, row in enumerate(rows.tolist()):
-        frame = bench + noise[row * 7 % 16]
+    noise = rng.normal(0, 1.5, (16, HEIGHT, WIDTH, 1))
+    flicker = rng.normal(0, 0.4, 997)
+    for row in rows.tolist():
+        # lamps flicker, so that no two pictures of a camera that runs are the same
+        frame = bench + noise[row * 7 % 16] + 1.2 * np.sin(2.1 * row) + flicker[row % 997]
         for i, colour in enumerate(((40, 60, 230), (230, 60, 40))):
             x = int(np.clip(e.scene[row, 2 * i], 0, 1) * (WIDTH - 22))
             y = int(np.clip(e.scene[row, 2 * i + 1], 0, 1) * (HEIGHT - 18))
             frame[y : y + 18, x : x + 22] = colour
-        frames[k] = np.clip(frame, 0, 255)
-    return frames
+        yield np.clip(frame, 0, 255).astype(np.uint8)
 
 
-def write_video(path: Path, frames: NDArray[np.uint8], rate: float) -> None:
+def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> None:
     """H.264 in MP4."""
     av: Any = importlib.import_module("av")
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        options = {"crf": "30", "g": "10", "preset": "ultrafast"}
+        options = {"crf": "21", "g": "10", "preset": "ultrafast"}
         stream = container.add_stream("libx264", rate=round(rate), options=options)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         for frame in frames:
@@ -134,7 +134,7 @@ def write_lerobot(root: Path, plan: Plan, library: Library, episodes: Sequence[E
     stats: list[dict[str, Any]] = []
     whole: dict[str, list[NDArray[Any]]] = {}
     tables: list[tuple[int, Any]] = []
-    films: dict[str, list[NDArray[np.uint8]]] = {c: [] for c in plan.cameras}
+    films: dict[str, list[tuple[Episode, Rows, int]]] = {c: [] for c in plan.cameras}
     start = 0
     for number, e in enumerate(episodes):
         n = len(e)
@@ -152,7 +152,7 @@ def write_lerobot(root: Path, plan: Plan, library: Library, episodes: Sequence[E
             "index": np.arange(start, start + n),
             "task_index": np.full(n, tasks.get(e.task, 99)),
         }
-        own = {k: statistics(v) for k, v in (vectors | plain).items()}
+        own = {k: _statistics(v) for k, v in (vectors | plain).items()}
         for k in ("observation.state", "action"):
             if e.false_stats:
                 for name, value in own[k].items():
@@ -167,19 +167,21 @@ def write_lerobot(root: Path, plan: Plan, library: Library, episodes: Sequence[E
             if seen is None:
                 continue
             key = f"observation.images.{camera}"
-            shown = pictures(e, seen, zlib.crc32(f"{plan.folder}{i}".encode()))
-            own[key] = _picture_statistics(shown)
+            seed = zlib.crc32(f"{plan.folder}{i}".encode())
+            some = seen[np.unique(np.linspace(0, len(seen) - 1, 8).astype(int))]
+            own[key] = _picture_statistics(list(pictures(e, some, seed)))
             if embedded:
                 kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
                 data = [
-                    {"bytes": encoded(f, "jpeg"), "path": f"{k}.jpg"} for k, f in enumerate(shown)
+                    {"bytes": encoded(frame, "jpeg"), "path": f"{k}.jpg"}
+                    for k, frame in enumerate(pictures(e, seen, seed))
                 ]
                 arrays[key] = pa.array(data, type=kind)
             elif v3:
-                films[camera].append(shown)
+                films[camera].append((e, seen, seed))
             else:
                 path = root / f"videos/chunk-000/{key}/episode_{number:06d}.mp4"
-                write_video(path, shown, e.video_rate or plan.fps)
+                write_video(path, pictures(e, seen, seed), e.video_rate or plan.fps)
         arrays |= {k: pa.array(v) for k, v in plain.items()}
         table = pa.table(arrays)
         for k, v in (vectors | plain).items():
@@ -200,7 +202,7 @@ def write_lerobot(root: Path, plan: Plan, library: Library, episodes: Sequence[E
             row |= {"dataset_from_index": start, "dataset_to_index": start + n}
             row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
             for camera, film in films.items() if not embedded else ():
-                first = sum(len(f) for f in film[:-1]) / plan.fps
+                first = sum(len(seen) for _, seen, _ in film[:-1]) / plan.fps
                 key = f"videos/observation.images.{camera}"
                 row |= {f"{key}/chunk_index": 0, f"{key}/file_index": 0}
                 row |= {f"{key}/from_timestamp": first, f"{key}/to_timestamp": first + n / plan.fps}
@@ -210,7 +212,7 @@ def write_lerobot(root: Path, plan: Plan, library: Library, episodes: Sequence[E
         start += n
     meta = root / "meta"
     meta.mkdir(parents=True, exist_ok=True)
-    total = {k: statistics(np.concatenate(v)) for k, v in whole.items()}
+    total = {k: _statistics(np.concatenate(v)) for k, v in whole.items()}
     info: dict[str, Any] = {
         "codebase_version": version,
         "robot_type": _robot(plan),
@@ -239,7 +241,7 @@ def write_lerobot(root: Path, plan: Plan, library: Library, episodes: Sequence[E
         for camera, film in films.items():
             if film:
                 path = root / f"videos/observation.images.{camera}/chunk-000/file-000.mp4"
-                write_video(path, np.concatenate(film), plan.fps)
+                write_video(path, (f for shot in film for f in pictures(*shot)), plan.fps)
         (meta / "episodes/chunk-000").mkdir(parents=True)
         path = meta / "episodes/chunk-000/file-000.parquet"
         pq.write_table(pa.Table.from_pylist(rows), str(path))
@@ -273,12 +275,19 @@ def _lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     path.write_text("".join(json.dumps(r) + "\n" for r in rows))
 
 
-def _picture_statistics(frames: NDArray[np.uint8]) -> dict[str, Any]:
-    some = frames[np.unique(np.linspace(0, len(frames) - 1, 8).astype(int))]
-    found = statistics(some.reshape(-1, 3) / 255)
-    return {k: [[[v]] for v in t] for k, t in found.items() if k != "count"} | {
-        "count": [len(some)]
-    }
+def _statistics(values: NDArray[Any]) -> dict[str, list[Any]]:
+    """As dexkit's, some columns at a time: touch has thousands."""
+    if values.ndim == 1:
+        return statistics(values)
+    blocks = [statistics(values[:, i : i + 200]) for i in range(0, values.shape[1], 200)]
+    names = [k for k in blocks[0] if k != "count"]
+    return {k: [v for b in blocks for v in b[k]] for k in names} | {"count": blocks[0]["count"]}
+
+
+def _picture_statistics(frames: Sequence[NDArray[np.uint8]]) -> dict[str, Any]:
+    found = statistics(np.stack(frames).reshape(-1, 3) / 255)
+    shaped = {k: [[[v]] for v in t] for k, t in found.items() if k != "count"}
+    return shaped | {"count": [len(frames)]}
 
 
 def write_xr(folder: Path, plan: Plan, library: Library, e: Episode) -> None:
@@ -329,8 +338,8 @@ def write_xr(folder: Path, plan: Plan, library: Library, e: Episode) -> None:
         seen = e.seen[camera]
         if seen is None:
             continue
-        shown = pictures(e, seen, zlib.crc32(f"{plan.folder}{i}".encode()))
-        for k, frame in enumerate(shown):
+        seed = zlib.crc32(f"{plan.folder}{i}".encode())
+        for k, frame in enumerate(pictures(e, seen, seed)):
             path = folder / f"colors/{int(e.numbers[k]):06d}_color_{i}.jpg"
             path.write_bytes(encoded(frame, "jpeg"))
     text = {"goal": e.task, "desc": e.task and f"{e.task}, with both hands.", "steps": ""}
