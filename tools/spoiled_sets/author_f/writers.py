@@ -16,7 +16,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from PIL import Image
 
-from dexkit.traces.sessions.lerobot_out import statistics
+from dexkit.traces.sessions.lerobot_out import TASKS_METADATA
+from dexkit.traces.sessions.lerobot_stats import statistics
 from tools.spoiled_sets.author_f.motion import (
     ARM,
     FINGERS,
@@ -246,8 +247,7 @@ def write_lerobot(root: Path, plan: Plan, library: Library, episodes: Sequence[E
         path = meta / "episodes/chunk-000/file-000.parquet"
         pq.write_table(pa.Table.from_pylist(rows), str(path))
         listed = pa.table({"task_index": list(tasks.values()), "task": list(tasks)})
-        pandas = {"index_columns": ["task"], "column_indexes": [], "columns": []}
-        listed = listed.replace_schema_metadata({"pandas": json.dumps(pandas)})
+        listed = listed.replace_schema_metadata(TASKS_METADATA)
         pq.write_table(listed, str(meta / "tasks.parquet"))
     else:
         info |= {"total_videos": len(plan.cameras) * len(episodes), "total_chunks": 1}
