@@ -186,6 +186,49 @@ def test_action_that_is_elsewhere_once() -> None:
     assert finding.joints == (4,)
 
 
+def test_action_of_an_arm_that_is_elsewhere_for_some_frames() -> None:
+    def odd(values: Floats) -> Floats:
+        values[60:63, 4] += 1.0
+        return values
+
+    [finding] = found(changed(episode(6, fps=10), "right_arm", action=odd), "jump")
+    assert (finding.part, finding.joints) == ("right_arm", (4,))
+    # a trigger may be pressed for a moment
+    assert not found(changed(episode(6, fps=10), "right_hand", action=odd), "jump")
+
+
+def test_drift_beyond_any_lag_of_a_part_of_the_episode() -> None:
+    at = np.arange(300) - np.linspace(0, 45, 300)
+
+    def late(values: Floats) -> Floats:
+        columns = [np.interp(at, np.arange(300), values[:, j]) for j in range(values.shape[1])]
+        return np.stack(columns, axis=1)
+
+    [finding] = found(changed(episode(7, seconds=10), "", state=late), "out-of-step")
+    assert "drifts" in finding.text
+
+
+def test_hand_that_an_object_stops_is_not_before_its_action() -> None:
+    """As the action goes on, and comes back slowly: the state moves first, and then again last."""
+    t = np.arange(600) / 50
+    asked = 0.5 + 0.5 * np.cos(2 * np.pi * (t + 1.0) / 8)
+    wanted = np.repeat(asked[:, None], 6, axis=1) + 0.01 * np.sin(t[:, None] + np.arange(6))
+    seen = np.maximum(wanted, 0.4) + np.random.default_rng(1).normal(0, 5e-4, wanted.shape)
+    source = episode(8, fps=50, seconds=12, hand="", joints=6)
+    held = changed(source, "right_hand", state=lambda _: seen, action=lambda _: wanted)
+    assert not found(held, "out-of-step")
+
+
+def test_observation_of_an_unknown_hand_that_is_renewed_too_seldom() -> None:
+    def stale(every: int) -> Episode:
+        index = np.arange(600) // every * every
+        source = episode(9, fps=50, seconds=12, hand="", joints=6)
+        return changed(source, "left_hand", state=lambda x: x[index])
+
+    assert not found(stale(10), "repeated")  # as Inspire's do
+    assert found(stale(12), "repeated")
+
+
 def test_rows_again_in_a_part_of_the_episode() -> None:
     index = np.arange(450)
     index[150:350] = index[150:350] // 3 * 3

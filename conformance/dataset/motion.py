@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,13 @@ __all__ = [
     "frames_of",
     "joined",
     "joints_text",
+    "median",
+    "middle",
     "moves",
     "part_text",
+    "quick_size",
     "runs_of",
+    "runs_of_joints",
     "series_of",
     "span",
     "speed_of",
@@ -30,6 +34,7 @@ Bools = NDArray[np.bool_]
 
 _REVERSALS = 12  # that a joint must show before its noise is spoken of
 _LARGEST = 1e6  # strokes, of numbers that are none: their squares are numbers still
+_LEAP = 3.0  # a leap's step against the fastest of its neighbours
 _STILL = 0.05  # share of frames with no change, at most, of a sensor that is called live: eight
 # such frames in a row are no chance
 
@@ -45,6 +50,18 @@ def span(values: Floats | None) -> Floats:
     return found
 
 
+def middle(values: Floats) -> float:
+    """The median, the higher of two; quicker than numpy's for a few values."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
+
+
+def quick_size(least: int) -> int:
+    """A length, not less, for which a Fourier transform is quick."""
+    power = 1 << max(least - 1, 1).bit_length()
+    return next(n for n in (power * 5 // 8, power * 3 // 4, power) if n >= least)
+
+
+@lru_cache(maxsize=64)
 def stroke(track: Track) -> Floats:
     """How far each joint can go, shape (joints,): by its limits, else by what is seen of it, and
     1 at least: a joint of unknown range that hardly moves is not measured by its noise.
@@ -58,10 +75,35 @@ def stroke(track: Track) -> Floats:
 
 def runs_of(mask: NDArray[np.bool_], least: int = 1) -> Iterator[tuple[int, int]]:
     """Begin and end (exclusive) of each run of true values that is at least so long."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
+    if not mask.any():
+        return
+    room = np.zeros(len(mask) + 2, dtype=np.bool_)
+    room[1:-1] = mask
+    edges = np.flatnonzero(room[1:] != room[:-1])
     for begin, end in edges.reshape(-1, 2).tolist():
         if end - begin >= least:
             yield begin, end
+
+
+def runs_of_joints(mask: Bools, least: int = 1) -> Iterator[tuple[int, int, int]]:
+    """The same of each joint, shape (frames, joints): joint, begin and end."""
+    if not mask.any():
+        return
+    count = len(mask) + 1
+    room = np.zeros((mask.shape[1], count), dtype=np.bool_)  # a frame between two joints
+    room[:, 1:] = mask.T
+    for begin, end in runs_of(room.ravel(), least):
+        joint = begin // count
+        yield joint, begin - joint * count - 1, end - joint * count - 1
+
+
+def median(values: Floats) -> float:
+    """As numpy's of finite numbers in one row, and quicker where they are few."""
+    half = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, half)[half])
+    both = np.partition(values, (half - 1, half))
+    return 0.5 * float(both[half - 1] + both[half])
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +127,39 @@ class Series:
     same: Bools
     quantum: Floats
     noise: Floats
+
+    @cached_property
+    def size(self) -> Floats:
+        """The steps without their sign, shape (frames, joints)."""
+        return np.abs(self.steps)
+
+    @cached_property
+    def spans(self) -> Floats:
+        """Highest less lowest, shape (joints,)."""
+        return np.asarray(self.q.max(axis=0) - self.q.min(axis=0))
+
+    def around(self, width: int = 0) -> Floats:
+        """The largest step of the three frames before each frame, and of the three that follow
+        it and ``width`` more, shape (frames, joints).
+        """
+        count = len(self.q)
+        found = self._threes[:count].copy(order="K")
+        after = found[: max(count - width, 0)]
+        np.maximum(after, self._threes[4 + width :][: len(after)], out=after)
+        return found
+
+    @cached_property
+    def _threes(self) -> Floats:
+        """The largest of three steps, of which the first ones end before the first frame."""
+        padded = np.zeros((len(self.q) + 6, self.q.shape[1]), order="F")
+        padded[3:-3] = self.size
+        return np.asarray(np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:]))
+
+    @cached_property
+    def leaps(self) -> Bools:
+        """Frames and joints whose step is far larger than those around it."""
+        floor = 3 * self.quantum + 6 * self.noise + 0.004
+        return np.asarray(self.size > _LEAP * self.around() + floor)
 
     def live(self, calm: Bools | None = None) -> Bools:
         """Whether each joint trembles, shape (joints,): its changes reverse again and again and
@@ -123,11 +198,14 @@ def _series_of(track: Track, what: str) -> Series | None:
     values = track.state if what == "state" else track.action
     if values is None or len(values) < 3:
         return None
-    there: Bools = np.asarray(np.isfinite(values).all(axis=1))
+    finite = np.isfinite(values)
+    whole = bool(finite.all())
+    there: Bools = np.asarray(finite.all(axis=1))
     if there.sum() < 3:
         return None
-    scaled = np.clip(values / stroke(track), -_LARGEST, _LARGEST)
-    if not there.all():
+    scaled = np.asfortranarray(values / stroke(track))  # joint by joint: sums are quick
+    np.clip(scaled, -_LARGEST, _LARGEST, out=scaled)
+    if not whole:
         last = np.maximum.accumulate(np.where(there, np.arange(len(there)), -1))
         last[last < 0] = int(np.argmax(there))
         scaled = scaled[last]
@@ -135,8 +213,12 @@ def _series_of(track: Track, what: str) -> Series | None:
     steps[1:] = scaled[1:] - scaled[:-1]
     both = np.zeros(len(there), dtype=np.bool_)
     both[1:] = there[1:] & there[:-1]
-    same = (steps == 0) & both[:, None]
-    steps[~both] = 0
+    same = steps == 0
+    if whole:
+        same[0] = False
+    else:
+        same &= both[:, None]
+        steps[~both] = 0
     sizes = np.abs(steps)
     quantum = np.where(sizes > 1e-7, sizes, np.inf).min(axis=0)
     bends = np.abs(steps[2:] - steps[1:-1])
@@ -149,8 +231,7 @@ def _series_of(track: Track, what: str) -> Series | None:
 
 def moves(series: Series, least: float = 0.05) -> Bools:
     """Whether each joint moves, shape (joints,): by a part of its stroke, and beyond its noise."""
-    spans = np.ptp(series.q, axis=0)
-    return np.asarray(spans > np.maximum(least, 12 * series.noise))
+    return np.asarray(series.spans > np.maximum(least, 12 * series.noise))
 
 
 def part_text(part: str) -> str:
@@ -168,11 +249,12 @@ def joints_text(track: Track, joints: Sequence[int]) -> str:
     return f"{len(joints)} of {count} joints of {part_text(track.part)}"
 
 
+@lru_cache(maxsize=1)  # of the episode that is being judged
 def joined(episode: Episode) -> Bools:
     """Whether each frame follows the one before it by one period, shape (frames,)."""
     found = np.ones(len(episode), dtype=np.bool_)
-    steps = np.diff(episode.t)
-    found[1:] = steps < 1.6 * np.median(steps) if len(steps) else True
+    steps = episode.t[1:] - episode.t[:-1]
+    found[1:] = steps < 1.6 * median(steps) if len(steps) else True
     return found
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.dataset.episode import Episode, Track
-from dexkit.conformance.dataset.motion import stroke
+from dexkit.conformance.dataset.motion import middle, quick_size, stroke
 from dexkit.hand import Floats
 
 __all__ = [
@@ -185,14 +185,14 @@ def _relation(episode: Episode, track: Track) -> Relation | None:
     if track.state.shape != track.action.shape:
         return None
     steps = episode.t[1:] - episode.t[:-1]
-    stride = max(1, int(1 / (_RATE * max(float(np.median(steps)), 1e-4))))
+    stride = max(1, int(1 / (_RATE * max(middle(steps), 1e-4))))
     state, action, t = track.state[::stride], track.action[::stride], episode.t[::stride]
     whole = np.isfinite(state.sum(axis=1) + action.sum(axis=1))
     if not whole.all():
         state, action, t = state[whole], action[whole], t[whole]
     if len(t) < _LEAST:
         return None
-    step = float(np.median(t[1:] - t[:-1]))
+    step = middle(t[1:] - t[:-1])
     wide = stroke(track)
     return Relation(track, t, step, state, action, wide, _lag(state, action, wide, step))
 
@@ -205,23 +205,13 @@ def _lag(state: Floats, action: Floats, wide: Floats, step: float) -> int:
         return 0
     most = len(state) // 3
     back, late = min(round(_EARLIEST / step), most), min(round(_LATEST / step), most)
-    # one long row of all joints with zeros between them: a shift of it is one of each joint
-    room = np.zeros((int(moving.sum()), len(state) + max(back, late)))
-    left, right = room, room.copy()
-    left[:, : len(state)], right[:, : len(state)] = s[:, moving].T, a[:, moving].T
-    x, y = left.ravel(), right.ravel()
-    # not divided by the overlap: ends lose little, and no shift wins by a short one
-    # einsum, not BLAS, whose threads cost more than such short sums where cores are busy
-    score = [
-        float(np.einsum("i,i->", *((x[k:], y[: len(y) - k]) if k >= 0 else (x[:k], y[-k:]))))
-        for k in range(-back, late + 1)
-    ]
-    return int(np.argmax(score)) - back
-
-
-def middle(values: Floats) -> float:
-    """The median, the higher of two; quicker than numpy's for a few values."""
-    return float(np.partition(values, len(values) // 2)[len(values) // 2])
+    # all shifts at once, with room for the longest: not divided by the overlap, as ends lose
+    # little, and no shift wins by a short one
+    size = quick_size(len(state) + max(back, late))
+    both = np.fft.rfft(np.concatenate((s[:, moving].T, a[:, moving].T)), size)
+    count = len(both) // 2
+    score = np.fft.irfft(np.einsum("ij,ij->j", both[:count], both[count:].conj()), size)
+    return int(np.argmax(score[np.arange(-back, late + 1)])) - back
 
 
 def running(values: Floats, back: int, ahead: int, best: np.ufunc) -> Floats:

@@ -23,10 +23,11 @@ from dexkit.conformance.dataset.motion import (
 )
 from dexkit.hand import Floats
 
-__all__ = ["CHECKS", "leaps"]
+__all__ = ["CHECKS"]
 
 _PERIODS = 15  # changes from which a period can be told
 _SLOW_S = 0.09  # s between two values: no hand or arm that sends 200 a second looks like this
+_SLOWEST_S = 0.22  # likewise of six joints, which may be an Inspire hand: it renews each 0.2 s
 _FAST_HZ = 150.0  # of hands whose values must be newer
 _REPEATS = 4  # frames of a run
 _LIVE = 3  # joints that tremble, from which no frame is the same as another by chance
@@ -34,7 +35,6 @@ _REPLAY_S = 0.4  # s of a stretch that is there again
 _LOST_S = 0.1  # s without frames that are worth a look; fewer are a remark
 _SILENT_S = 0.3  # s without a state of a hand
 _LONG_S = 1.0  # s after which too much is missing
-_LEAP = 3.0  # a leap's step against the fastest of its neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,15 +289,14 @@ def _unrepeatable(table: _Table, begin: int, end: int) -> bool:
 def _stale(episode: Episode, table: _Table) -> Iterator[Finding]:
     """States that are renewed more seldom than the frames, though the part sends more of them."""
     for track, state in table.states:
-        if track.model is None and track.is_hand:
-            continue  # six joints may be those of an Inspire hand, which renews each 0.2 s
+        limit = _SLOWEST_S if track.model is None and track.is_hand else _SLOW_S
         if track.model is not None and track.model.min_state_rate < _FAST_HZ:
             continue
         every, begin, end = _period([state], np.asarray(state.same.all(axis=1)))
         if end - begin < 0.5 * len(episode):
             continue
         action = series_of(track, "action")
-        if every * (1 / episode.fps) < _SLOW_S or action is None:
+        if every / episode.fps < limit or action is None:
             continue
         if _period([action], np.asarray(action.same.all(axis=1)))[0] == every:
             continue
@@ -309,7 +308,7 @@ def _stale(episode: Episode, table: _Table) -> Iterator[Finding]:
             "so much too old",
             track.part,
             value=round(every / episode.fps, 3),
-            limit=_SLOW_S,
+            limit=limit,
             unit="s",
         )
 
@@ -452,30 +451,14 @@ def _at_once(a: Finding, b: Finding) -> bool:
     return abs(a.begin_s - b.begin_s) < 0.1 and abs((a.value or 0) - (b.value or 0)) < 0.2
 
 
-def leaps(series: Series) -> Bools:
-    """Frames and joints whose step is far larger than those around it, which go the same way."""
-    steps = series.steps
-    size = np.abs(steps)
-    n = len(size)
-    near = np.zeros_like(size)
-    before, after = np.zeros_like(size), np.zeros_like(size)
-    for k in (1, 2, 3):
-        before[k:] = np.maximum(before[k:], size[: n - k])
-        after[: n - k] = np.maximum(after[: n - k], size[k:])
-    np.maximum(before, after, out=near)
-    floor = 3 * series.quantum + 6 * series.noise + 0.004
-    found: Bools = size > _LEAP * near + floor
-    return found
-
-
 def _leaps(episode: Episode) -> Iterator[Finding]:
     """Frames at which states and actions of all parts leap at once, and go on as before."""
     table = _table(episode)
     if len(episode) < 12:
         return
     names = {t.part for t, _ in table.states} & {t.part for t, _ in table.actions}
-    states = {t.part: leaps(s) for t, s in table.states if t.part in names}
-    actions = {t.part: leaps(s) for t, s in table.actions if t.part in names}
+    states = {t.part: s.leaps for t, s in table.states if t.part in names}
+    actions = {t.part: s.leaps for t, s in table.actions if t.part in names}
     moved = {t.part: s for t, s in table.states}
     parts = [(states[p].any(axis=1) & actions[p].any(axis=1)) for p in sorted(names)]
     if not parts:

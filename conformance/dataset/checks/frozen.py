@@ -23,6 +23,7 @@ from dexkit.conformance.dataset.motion import (
     joints_text,
     part_text,
     runs_of,
+    runs_of_joints,
     series_of,
     speed_of,
 )
@@ -68,8 +69,7 @@ def _stretches(episode: Episode, track: Track, state: Series) -> Iterator[_Stret
     action = series_of(track, "action")
     runs = [
         (j, begin - 1, end)  # the first frame of the same value is not the same as before
-        for j in range(state.q.shape[1])
-        for begin, end in runs_of(state.same[:, j], least)
+        for j, begin, end in runs_of_joints(state.same, least)
     ]
     if not runs:
         return

@@ -34,7 +34,7 @@ def _idle(episode: Episode) -> Iterator[Finding | Figure]:
     times = {"begin": float(episode.t[begin]), "end": float(episode.duration - episode.t[end])}
     idle = sum(times.values())
     yield Figure("idle, %", 100 * idle / episode.duration)
-    pause = _longest_pause(episode, begin, end)
+    pause = _longest_pause(episode, begin, end) if max(times.values()) > _LONG_S else 0.0
     for where, seconds in times.items():
         if seconds < _REMARK_S:
             continue

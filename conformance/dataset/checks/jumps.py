@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from dexkit.conformance.dataset.check import Check, Data
-from dexkit.conformance.dataset.checks.frames import leaps
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.motion import (
@@ -26,6 +25,7 @@ __all__ = ["CHECKS"]
 _LEAST = 0.08  # strokes: a leap that is worth a word
 _ODD = 0.15  # strokes: a single action that far off is no tremor
 _NOISES = 10.0  # standard deviations
+_ODD_S = 0.5  # for which an arm's action may be out of line: another solution of its solver
 _ISOLATED = 4.0  # times the fastest step around it
 _MARGIN = 3.0  # times the speed limit: Inspire's real hands do 2.2 times what is taken for theirs
 _FASTEST = 40.0  # rad/s, of any joint without a profile: arms do 20, fingers 24
@@ -46,7 +46,7 @@ def _jumps(episode: Episode) -> Iterator[Finding]:
         spikes, steps = _leaps(episode, track, state, action)
         at_once += steps.any(axis=1)
         if steps.any():
-            ordered |= np.zeros_like(ordered) if action is None else leaps(action).any(axis=1)
+            ordered |= np.zeros_like(ordered) if action is None else action.leaps.any(axis=1)
             held[1:] &= state.same[:-1].all(axis=1) | ~steps[1:].any(axis=1)
         found.append((track, spikes, steps))
     together = (at_once > 1) & (at_once == len(found))
@@ -73,15 +73,20 @@ def _odd_actions(episode: Episode) -> Iterator[Finding]:
         action = series_of(track, "action")
         if action is None or len(action.q) < 8:
             continue
-        size = np.abs(action.steps)
+        size = action.size
         floor = np.maximum(_ODD, np.maximum(_NOISES * action.noise, 3 * action.quantum))
-        big = (size > floor) & (action.there & joined(episode))[:, None]
+        big = size > floor
+        if not big.any():
+            continue
+        big &= (action.there & joined(episode))[:, None]
         spikes = np.zeros_like(big)
-        for width in (1, 2):
+        # a hand that is told to close and open by a trigger may be told so for a moment
+        longest = 2 if track.is_hand else max(2, frames_of(episode, _ODD_S))
+        for width in range(1, min(longest, len(size) - 1) + 1):
             out, back = action.steps[:-width], action.steps[width:]
             hit = big[:-width] & big[width:] & (out * back < 0)
             hit &= np.abs(out + back) < 0.3 * np.abs(out)
-            hit &= np.abs(out) > _ISOLATED * _calm_around(size, width)[:-width]
+            hit &= np.abs(out) > _ISOLATED * action.around(width)[:-width]
             spikes[:-width] |= hit
         # triggers and buttons have steps, clicks as well
         steps = big.sum(axis=0) - 2 * spikes.sum(axis=0)
@@ -100,7 +105,8 @@ def _odd_actions(episode: Episode) -> Iterator[Finding]:
             Use.REVIEW,
             f"the action of {joints_text(track, joints.tolist())} leaps out and back {where}, by "
             f"{far[at, joint]:.3g} {unit}".rstrip()
-            + ", within 2 frames: single wrong values",
+            + f", within {max(2 / episode.fps, _ODD_S if longest > 2 else 0):.2g} s: it is no "
+            "motion, but wrong values",
             track.part,
             () if len(joints) == len(track.joints) else tuple(joints.tolist()),
             float(episode.t[max(frames[0] - 1, 0)]),
@@ -125,19 +131,15 @@ def _leaps(
     episode: Episode, track: Track, state: Series, action: Series | None
 ) -> tuple[Bools, Bools]:
     """Frames and joints of values out of line for 1 to 3 frames, and of leaps that stay."""
-    q, steps = state.q, state.steps
-    size = np.abs(steps)
-    n = len(q)
+    size, steps = state.size, state.steps
+    n = len(size)
     floor = np.maximum(_LEAST, np.maximum(_NOISES * state.noise, 3 * state.quantum))
-    around = np.zeros_like(size)
-    for k in (1, 2, 3):
-        around[k:] = np.maximum(around[k:], size[: n - k])
-        around[: n - k] = np.maximum(around[: n - k], size[k:])
     big = size > floor
-    big &= (state.there & joined(episode))[:, None]
     spikes, stays = np.zeros_like(big), np.zeros_like(big)
     if not big.any():
         return spikes, stays
+    big &= (state.there & joined(episode))[:, None]
+    around = state.around()
     given = _given(episode, action, size.shape)
     unexplained = big & ((given < _EXPLAINS * size) | _leaves(episode, state, action, size))
     # out and back: the values before and after it agree
@@ -148,8 +150,7 @@ def _leaps(
         opposite = (out * back < 0) & (np.abs(out + back) < 0.3 * np.abs(out))
         sizable = unexplained[: n - width] & (np.abs(back) > floor)
         hit = opposite & sizable
-        calm = _calm_around(size, width)
-        hit &= np.abs(out) > _ISOLATED * calm[: n - width]
+        hit &= np.abs(out) > _ISOLATED * state.around(width)[: n - width]
         spikes[: n - width] |= hit
     # a leap that stays, alone among slow steps, or faster than any joint
     held = _held_for(state)
@@ -161,18 +162,6 @@ def _leaps(
     for width in (1, 2, 3):
         stays[width:] &= ~spikes[: n - width]
     return spikes, stays
-
-
-def _calm_around(size: Floats, width: int) -> Floats:
-    """The largest step around each frame, without those of a spike that begins there."""
-    n = len(size)
-    found = np.zeros_like(size)
-    for k in (-3, -2, -1, width + 1, width + 2, width + 3):
-        if k < 0:
-            found[-k:] = np.maximum(found[-k:], size[: n + k])
-        else:
-            found[: n - k] = np.maximum(found[: n - k], size[k:])
-    return found
 
 
 def _held_for(state: Series) -> Floats:

@@ -12,9 +12,13 @@ from dexkit.conformance.dataset.checks.assignment import misassigned
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.motion import (
+    Bools,
     frames_of,
+    median,
     moves,
     part_text,
+    quick_size,
+    runs_of_joints,
     series_of,
     speed_of,
     stroke,
@@ -29,6 +33,10 @@ LAG = "lag of the {}, s"
 _REACH_S = 1.5  # of delays that are tried, both ways
 _SURE = 0.7  # correlation from which a delay is believed
 _FIRM = 0.8  # from which it is a reason: the other hand's action may be like it by 0.78
+_CLEAR = 0.95  # above which no object stops a hand
+_STOPS_S = 0.5  # s in which the state of a joint comes to rest after its action
+_STANDS = 0.004  # strokes in 0.1 s that a joint moves which an object stops
+_STOPPED = 0.1  # strokes that its action moves on, or is away from it
 _SHARP = 0.9  # and from which it is compared with that of other episodes
 _LATEST_HAND_S = 0.7  # Inspire's hands on a G1 are 0.4 s behind, with values up to 0.13 s old
 _LATEST_QUICK_S = (
@@ -45,6 +53,9 @@ _DRIFT_S = 0.09
 _DRIFT_ALONE_S = 0.2  # of one part alone
 _SMOOTH_S = 0.1
 _BETTER = 0.06  # correlation by which a growing lag must exceed a constant one
+_FAR_BETTER = 0.12  # likewise, where no part of the episode has a lag of its own
+_FAR_S = 2.0  # s of lag at the end that are tried
+_FAR_LEAST_S = 5.0  # s of an episode in which this can be told
 _ENOUGH = 0.1  # of a joint's motion, that a third of an episode has at least
 _NO_UNIT = 2.0  # strokes that no joint moves: it counts in another unit
 _RENEWED_S = 0.25  # s in which the slowest registers are renewed
@@ -74,11 +85,10 @@ def lag_of(state: Floats, action: Floats, fps: float) -> Lag | None:
     reach = min(round(_REACH_S * fps), n // 3)
     if reach < 4:
         return None
-    size = 1 << int(np.ceil(np.log2(n + 2 * reach)))
-    both = np.fft.rfft(np.concatenate([state, action], axis=1), size, axis=0)
-    s, a = both[:, : state.shape[1]], both[:, state.shape[1] :]
-    cross = np.fft.irfft((s * a.conj()).sum(axis=1), size)
-    auto = np.fft.irfft((np.abs(a) ** 2).sum(axis=1), size)
+    size = quick_size(n + 2 * reach)
+    both = np.fft.rfft(np.concatenate((state.T, action.T)), size)
+    s, a = both[: state.shape[1]], both[state.shape[1] :]
+    cross, auto = np.fft.irfft(np.stack([np.einsum("ij,ij->j", x, a.conj()) for x in (s, a)]), size)
     power = np.sqrt(auto[0] * float((state**2).sum()))
     if power <= 0:
         return None
@@ -125,10 +135,14 @@ def _rise(c: Floats, peak: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Speeds:
-    """The speeds of the joints of a part that move, smoothed, shape (frames, joints)."""
+    """The speeds of the joints of a part that move, smoothed, shape (frames, joints).
+
+    :param use: which joints of the part these are.
+    """
 
     state: Floats
     action: Floats
+    use: Bools
 
 
 def _speeds(episode: Episode, track: Track) -> _Speeds | None:
@@ -139,16 +153,46 @@ def _speeds(episode: Episode, track: Track) -> _Speeds | None:
     if not use.any():
         return None
     width = max(2, round(_SMOOTH_S * episode.fps))
-    s, a = (_smoothed(x.steps[:, use], width) for x in (state, action))
     # joints count alike, whatever their way
-    s = s / np.maximum(np.sqrt((s**2).sum(axis=0)), 1e-12)
-    a = a / np.maximum(np.sqrt((a**2).sum(axis=0)), 1e-12)
-    return _Speeds(s, a)
+    s, a = (_scaled(_smoothed(x.steps[:, use], width)) for x in (state, action))
+    return _Speeds(s, a, use)
+
+
+def _scaled(values: Floats) -> Floats:
+    """Columns of length 1."""
+    size = np.sqrt(np.einsum("ij,ij->j", values, values))
+    return np.asarray(values / np.maximum(size, 1e-12))
+
+
+def _unheld(episode: Episode, track: Track, speeds: _Speeds) -> _Speeds:
+    """Without the actions of joints that an object, or an end, stops: the action goes on and
+    comes back there while the state stands still, which says nothing of a delay.
+    """
+    state, action = series_of(track, "state"), series_of(track, "action")
+    assert state is not None
+    assert action is not None
+    begin_s, end_s = frames_of(episode, _STOPS_S), frames_of(episode, _LATEST_HAND_S)
+    width = max(2, round(_SMOOTH_S * episode.fps))
+    moved = np.abs(_smoothed(state.steps, width))
+    still = moved < np.maximum(_STANDS, np.maximum(6 * state.noise, 1.5 * state.quantum))
+    kept = speeds.action.copy(order="K")
+    columns = np.flatnonzero(speeds.use).tolist()
+    for k, begin, end in runs_of_joints(still[:, speeds.use], begin_s):
+        # what it does as the state comes to rest, or begins to move, may be a delay
+        first = begin + begin_s if begin > 1 else begin
+        last = end - end_s if end < len(still) - 1 else end
+        inner = action.q[first : last + 1, columns[k]]
+        if len(inner) > 1:
+            away = np.abs(inner - state.q[(begin + end) // 2, columns[k]])
+            if np.ptp(inner) > _STOPPED or away.min() > _STOPPED:
+                kept[begin:end, k] = 0
+    return _Speeds(speeds.state, kept, speeds.use)
 
 
 def _smoothed(values: Floats, width: int) -> Floats:
-    sums = np.cumsum(np.pad(values, ((width, 0), (0, 0))), axis=0)
-    return np.asarray(sums[width:] - sums[:-width])
+    sums = np.cumsum(values, axis=0)
+    sums[width:] -= sums[:-width].copy()
+    return np.asarray(sums)
 
 
 @dataclass(frozen=True)
@@ -177,6 +221,12 @@ def _out_of_step(episode: Episode) -> Iterator[Finding | Figure]:
             continue
         lag = lag_of(speeds.state, speeds.action, episode.fps)
         drift = _drift(episode, track, speeds) if _may_drift(speeds, lag, episode.fps) else None
+        if drift is None and (lag is None or lag.correlation < _CLEAR):
+            free = _unheld(episode, track, speeds)
+            without = lag_of(free.state, free.action, episode.fps)
+            if without is not None and (lag is None or without.correlation > lag.correlation):
+                speeds, lag = free, without
+            drift = _far_drift(episode, track, speeds, lag)
         if drift is not None:
             found.append(drift)
         elif lag is not None and lag.correlation >= _SURE:
@@ -197,7 +247,8 @@ def _out_of_step(episode: Episode) -> Iterator[Finding | Figure]:
         yield from _apart(lags)
     hands = [lag.seconds for track, lag in lags.values() if track.is_hand]
     if lags:
-        yield Figure("lag, s", float(np.median(hands or [lag.seconds for _, lag in lags.values()])))
+        usual = hands or [lag.seconds for _, lag in lags.values()]
+        yield Figure("lag, s", median(np.array(usual)))
     for part, (_, lag) in lags.items():
         if lag.correlation > _SHARP:
             yield Figure(LAG.format(part.replace("_", " ")), lag.seconds)
@@ -223,8 +274,8 @@ def _told(found: list[_Step]) -> Iterator[Finding]:
             )
         else:
             text = (
-                f"{what} drifts against its action, from {worst.ends[0]:.2f} s behind it in the "
-                f"first third to {worst.ends[1]:.2f} s in the last"
+                f"{what} drifts against its action, from {worst.ends[0]:.2f} s behind it at the "
+                f"begin to {worst.ends[1]:.2f} s at the end"
             )
         yield Finding(
             "out-of-step",
@@ -308,6 +359,31 @@ def _drift(episode: Episode, track: Track, speeds: _Speeds) -> _Step | None:
     return _Step("drift", track, drift, limit, growing, (found[0].peak_s, found[2].peak_s))
 
 
+def _far_drift(episode: Episode, track: Track, speeds: _Speeds, lag: Lag | None) -> _Step | None:
+    """A lag that grows so much that no third of an episode has one of its own: the line that
+    explains the whole of it far better than any constant lag. Of hands it is not told: what they
+    hold makes them late as well.
+    """
+    steady = 0.0 if lag is None else lag.correlation
+    if track.is_hand or steady > _FIRM - _FAR_BETTER or episode.duration < _FAR_LEAST_S:
+        return None
+    stride = max(1, round(_SMOOTH_S * episode.fps / 2))
+    few = _Speeds(speeds.state[::stride], speeds.action[::stride], speeds.use)
+    fps = episode.fps / stride
+    time = np.linspace(0.0, 1.0, len(few.state))
+    best, first, last = 0.0, 0.0, 0.0
+    ends = np.arange(-_FAR_S, _FAR_S + 0.01, 0.1)
+    for begin in np.arange(0.0, _LATEST_HAND_S, 0.1).tolist():
+        for end in ends[np.abs(ends - begin) > _DRIFT_ALONE_S].tolist():
+            match = _match(few, (begin + (end - begin) * time) * fps)
+            if match > best:
+                best, first, last = match, begin, end
+    if best < _FIRM or best - steady < _FAR_BETTER:
+        return None
+    limit = max(_DRIFT_FRAMES / episode.fps, _DRIFT_S)
+    return _Step("drift", track, last - first, limit, best, (first, last))
+
+
 def _may_drift(speeds: _Speeds, lag: Lag | None, fps: float) -> bool:
     """Whether what a constant lag leaves over goes with time and the change of the action, as a
     small drift makes it; a large one leaves little correlation. Cheaper than to look for it.
@@ -380,11 +456,11 @@ def _stamps(episode: Episode) -> Iterator[Finding]:
             limit=0.0,
         )
         return
-    usual = float(np.median(steps))
+    usual = median(steps)
     if episode.numbers is not None:
         ahead = np.diff(episode.numbers)
         if (ahead > 0).all():
-            usual = float(np.median(steps / ahead))
+            usual = median(steps / ahead)
     rate = 1 / usual
     if abs(rate / episode.fps - 1) > _OFF:
         yield Finding(
@@ -397,7 +473,8 @@ def _stamps(episode: Episode) -> Iterator[Finding]:
             unit="Hz",
         )
         return
-    spread = float(np.percentile(np.abs(steps - usual), 75)) / usual
+    off = np.abs(steps - usual)
+    spread = float(np.partition(off, 3 * len(off) // 4)[3 * len(off) // 4]) / usual
     if spread > _JITTER:
         yield Finding(
             "fps",
