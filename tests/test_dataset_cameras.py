@@ -440,6 +440,14 @@ def test_a_noisy_picture_that_freezes_is_found(
     assert found.begin_s == pytest.approx(4.0, abs=2.0)
 
 
+def test_noise_that_stops_is_found_where_little_else_is_seen(tmp_path: Path) -> None:
+    q = reaches(10, FPS)
+    pictures = of_wall(scene(q))
+    pictures[4 * FPS :] = [pictures[4 * FPS]] * (len(pictures) - 4 * FPS)
+    write_video(tmp_path / "v.mp4", pictures, codec=("libx264", {"crf": "10"}))
+    assert only(episode_with(tmp_path, q)).check == "camera-frozen"
+
+
 @each(
     "name",
     {

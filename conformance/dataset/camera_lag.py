@@ -34,7 +34,6 @@ _LEAST_LENGTH = 6.0  # s of an episode; in a shorter one anything may correlate
 _EACH_THIRD = 0.3  # correlation in each third of the episode
 _BETTER = 0.12  # correlation, than in step; what fits by chance gains two thirds of that
 _CLEAR_DRIFT = 0.7  # correlation with the best drift
-_IN_STEP = 0.5  # s
 _DRIFTS: Floats = 0.2 * np.arange(-20, 21, dtype=np.float64)  # s from start to end that are tried
 
 
@@ -238,7 +237,7 @@ def _judged(
         clear = steady[which].max() >= max(_CLEAR, in_step + _BETTER)
 
     # a stream is in step where it is begun, or where it is cut
-    possible = (np.abs(end - begin) >= DRIFT) & (np.minimum(np.abs(begin), np.abs(end)) <= _IN_STEP)
+    possible = (np.abs(end - begin) >= DRIFT) & (np.minimum(np.abs(begin), np.abs(end)) <= LATENCY)
     fits = np.where(possible & arms[:, None, None], curves, -1.0)
     signal, row, column = np.unravel_index(int(np.argmax(fits)), fits.shape)
     first, last = float(begin[row, column]), float(end[row, column])

@@ -169,12 +169,10 @@ def frozen(track: CameraTrack, motion: Motion, late_by: Floats | None = None) ->
     """
     if len(track) < 4 or len(motion.t) < 4:
         return
-    runs = _still_runs(track)
-    for begin, end in runs:
-        if end - begin >= len(track) - 2:
-            yield from _always_still(track, motion)
-            return
-    found = [(b, e) for b, e in runs if _is_frozen(track, motion, b, e)]
+    if (track.digests == track.digests[0]).all():
+        yield from _always_still(track, motion)
+        return
+    found = [(b, e) for b, e in _still_runs(track) if _is_frozen(track, motion, b, e)]
     if not found:
         return
     seen_at = track.t if late_by is None else track.t + late_by
@@ -208,8 +206,6 @@ def _path(motion: Motion, begin: float, end: float) -> Floats:
 
 def _always_still(track: CameraTrack, motion: Motion) -> Iterator[Finding]:
     """The same picture throughout: a remark; it may be a camera that sees nothing that moves."""
-    if (track.digests != track.digests[0]).any():
-        return
     if _path(motion, 0.0, float(motion.t[-1])).sum() < _LEAST_MOTION:
         return
     text = (
