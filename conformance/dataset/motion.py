@@ -18,6 +18,7 @@ __all__ = [
     "joined",
     "joints_text",
     "median",
+    "medians",
     "middle",
     "moves",
     "part_text",
@@ -97,13 +98,18 @@ def runs_of_joints(mask: Bools, least: int = 1) -> Iterator[tuple[int, int, int]
         yield joint, begin - joint * count - 1, end - joint * count - 1
 
 
-def median(values: Floats) -> float:
-    """As numpy's of finite numbers in one row, and quicker where they are few."""
+def medians(values: Floats) -> Floats:
+    """As numpy's of finite numbers along the first axis, and quicker where they are few."""
     half = len(values) // 2
     if len(values) % 2:
-        return float(np.partition(values, half)[half])
-    both = np.partition(values, (half - 1, half))
-    return 0.5 * float(both[half - 1] + both[half])
+        return np.asarray(np.partition(values, half, axis=0)[half])
+    both = np.partition(values, (half - 1, half), axis=0)
+    return np.asarray(0.5 * (both[half - 1] + both[half]))
+
+
+def median(values: Floats) -> float:
+    """The same of one row."""
+    return float(medians(values))
 
 
 @dataclass(frozen=True, eq=False)

@@ -198,17 +198,18 @@ def _relation(episode: Episode, track: Track) -> Relation | None:
 
 
 def _lag(state: Floats, action: Floats, wide: Floats, step: float) -> int:
-    s, a = _unit(state), _unit(action)
-    spread = np.sqrt(np.minimum(state.var(axis=0), action.var(axis=0)))
+    (s, of_state), (a, of_action) = _centred(state), _centred(action)
+    spread = np.minimum(of_state, of_action) / np.sqrt(len(state))
     moving = spread > _MOVES / 4 * wide
     if not moving.any():
         return 0
+    s, a = s[:, moving] / of_state[moving], a[:, moving] / of_action[moving]
     most = len(state) // 3
     back, late = min(round(_EARLIEST / step), most), min(round(_LATEST / step), most)
     # all shifts at once, with room for the longest: not divided by the overlap, as ends lose
     # little, and no shift wins by a short one
     size = quick_size(len(state) + max(back, late))
-    both = np.fft.rfft(np.concatenate((s[:, moving].T, a[:, moving].T)), size)
+    both = np.fft.rfft(np.concatenate((s.T, a.T)), size)
     count = len(both) // 2
     score = np.fft.irfft(np.einsum("ij,ij->j", both[:count], both[count:].conj()), size)
     return int(np.argmax(score[np.arange(-back, late + 1)])) - back
@@ -238,8 +239,13 @@ def correlations(left: Floats, right: Floats) -> Floats:
     return np.asarray(np.einsum("ij,ik->jk", _unit(left), _unit(right)))
 
 
+def _centred(values: Floats) -> tuple[Floats, Floats]:
+    """Columns without their mean, and the length of each, shape (columns,)."""
+    found = values - values.sum(axis=0) / len(values)
+    return found, np.sqrt(np.einsum("ij,ij->j", found, found))
+
+
 def _unit(values: Floats) -> Floats:
     """Columns without their mean and of length 1; 0 where one does not move."""
-    found = values - values.sum(axis=0) / len(values)
-    size = np.sqrt(np.einsum("ij,ij->j", found, found))
+    found, size = _centred(values)
     return np.asarray(found / np.where(size > 1e-9 * np.sqrt(len(values)), size, np.inf))

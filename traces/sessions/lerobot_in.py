@@ -176,6 +176,7 @@ class Dataset:
         self._tables: dict[tuple[Path, bool, tuple[int, int] | None], Any] = {}
         self._statistics: dict[int, dict[str, dict[str, Floats]]] | None = None
         self.only: tuple[int, int] | None = None
+        self._assigned: dict[tuple[str, ...], tuple[list[_Group], Problems, list[str]]] = {}
         self._problems: list[str] = []
         self._tasks = self._read_tasks()
         self._rows = self._read_episodes()
@@ -537,6 +538,20 @@ class Dataset:
                 yield Part(group.name, group.joints, good, group.model)
 
     def _groups(
+        self, names: Sequence[str], problems: Problems, corrections: list[str]
+    ) -> list[_Group]:
+        """The parts of a vector with such elements; what is wrong with them is told each time."""
+        key = tuple(names)
+        if key not in self._assigned:
+            own, corrected = Problems(), list[str]()
+            self._assigned[key] = self._assign(names, own, corrected), own, corrected
+        groups, own, corrected = self._assigned[key]
+        for text in own.sentences():
+            problems.add(text)
+        corrections += corrected
+        return groups
+
+    def _assign(
         self, names: Sequence[str], problems: Problems, corrections: list[str]
     ) -> list[_Group]:
         """Assign a vector's elements to parts."""

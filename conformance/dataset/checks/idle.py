@@ -9,7 +9,7 @@ import numpy as np
 from dexkit.conformance.dataset.check import Check, Figure
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding, Use
-from dexkit.conformance.dataset.motion import frames_of, runs_of, series_of
+from dexkit.conformance.dataset.motion import Bools, frames_of, medians, runs_of, series_of
 from dexkit.hand import Floats
 
 __all__ = ["CHECKS"]
@@ -73,11 +73,11 @@ def _still(episode: Episode) -> tuple[int, int]:
             if series is state and (2.5 * series.quantum > _STILL).any():
                 limit = np.minimum(limit, 0.06)  # two steps of the coarsest encoders
             # only what other parts leave still is looked at
-            first = np.median(series.q[: smooth + 1], axis=0)
-            moved = (np.abs(series.q[:begin] - first) > limit).any(axis=1)
+            first = medians(series.q[: smooth + 1])
+            moved = _beyond(series.q[:begin], first, limit)
             begin = int(np.argmax(moved)) if moved.any() else begin
-            last = np.median(series.q[-smooth - 1 :], axis=0)
-            moved = (np.abs(series.q[:end:-1] - last) > limit).any(axis=1)
+            last = medians(series.q[-smooth - 1 :])
+            moved = _beyond(series.q[:end:-1], last, limit)
             end = count - 1 - int(np.argmax(moved)) if moved.any() else end
     if begin >= count:
         return count, count
@@ -87,6 +87,11 @@ def _still(episode: Episode) -> tuple[int, int]:
         if state is not None and action is not None and _holds(state.q[end:], action.q[end:]):
             return begin, count - 1
     return begin, end
+
+
+def _beyond(values: Floats, level: Floats, limit: Floats) -> Bools:
+    """Frames in which a joint is further than that from a level."""
+    return np.asarray(((values > level + limit) | (values < level - limit)).any(axis=1))
 
 
 def _longest_pause(episode: Episode, begin: int, end: int) -> float:
@@ -107,7 +112,7 @@ def _longest_pause(episode: Episode, begin: int, end: int) -> float:
 
 
 def _holds(state: Floats, action: Floats) -> bool:
-    return bool((np.abs(np.median(action - state, axis=0)) > _HOLDS).any())
+    return bool((np.abs(medians(action - state)) > _HOLDS).any())
 
 
 CHECKS = (Check("idle", "Long idle time at the start or the end", frozenset(), _idle),)

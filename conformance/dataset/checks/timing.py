@@ -154,7 +154,10 @@ def _speeds(episode: Episode, track: Track) -> _Speeds | None:
         return None
     width = max(2, round(_SMOOTH_S * episode.fps))
     # joints count alike, whatever their way
-    s, a = (_scaled(_smoothed(x.steps[:, use], width)) for x in (state, action))
+    whole = bool(use.all())
+    s, a = (
+        _scaled(_smoothed(x.steps if whole else x.steps[:, use], width)) for x in (state, action)
+    )
     return _Speeds(s, a, use)
 
 
@@ -497,9 +500,11 @@ def _speed_limits(episode: Episode) -> Iterator[Finding]:
         if len(state.q) <= 2 * window:
             continue
         speed = np.abs(state.q[window:] - state.q[:-window]) * (episode.fps / window)
-        if (np.ptp(state.q, axis=0) > _NO_UNIT).any():
+        if (state.spans > _NO_UNIT).any():
             continue
         allowed = track.fastest / stroke(track)
+        if not (speed > 3.0 * allowed).any():
+            continue
         moving = speed > 0.3 * allowed
         counts = moving.sum(axis=0)
         fast = np.where(moving, speed / allowed, 0)
