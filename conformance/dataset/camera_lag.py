@@ -33,6 +33,7 @@ _ELSEWHERE = 0.4  # s from a peak
 _LEAST_LENGTH = 6.0  # s of an episode; in a shorter one anything may correlate
 _EACH_THIRD = 0.3  # correlation in each third of the episode
 _BETTER = 0.12  # correlation, than in step; what fits by chance gains two thirds of that
+_FASTEST_DRIFT = 0.25  # s a second: of few motions, two others fit if moved further
 _CLEAR_DRIFT = 0.7  # correlation with the best drift
 _DRIFTS: Floats = 0.2 * np.arange(-20, 21, dtype=np.float64)  # s from start to end that are tried
 
@@ -238,6 +239,7 @@ def _judged(
 
     # a stream is in step where it is begun, or where it is cut
     possible = (np.abs(end - begin) >= DRIFT) & (np.minimum(np.abs(begin), np.abs(end)) <= LATENCY)
+    possible &= np.abs(end - begin) <= _FASTEST_DRIFT * times[-1]
     fits = np.where(possible & arms[:, None, None], curves, -1.0)
     signal, row, column = np.unravel_index(int(np.argmax(fits)), fits.shape)
     first, last = float(begin[row, column]), float(end[row, column])
