@@ -21,7 +21,8 @@ _CUT_S = 1.2  # s by which an end may have been cut
 _OTHER = (
     0.03  # difference, against the motion: a copy with noise has less, another take 0.3 or more
 )
-_ROUGH = 0.25  # the same at a shift that is wrong by a quarter of a step, 0.1 for a quick motion
+_LEAST = 0.85  # of the longer one that must be in both
+_ROUGH = 0.2  # the same at a shift that is wrong by a quarter of a step, 0.1 for a quick motion
 _STILL = 0.02  # strokes: less is no motion that could be found again
 
 
@@ -116,7 +117,7 @@ def _rough(x: Floats, table: Floats, lengths: NDArray[np.intp], step: float) -> 
     :param table: the others, shape (others, numbers); 0 behind the end of each.
     """
     best = np.full(len(table), np.inf)
-    least = 0.85 * np.maximum(lengths, len(x)) - 5
+    least = _LEAST * np.maximum(lengths, len(x)) - 5
     reach = int(np.ceil(_CUT_S / step))
     between = (table[:, 1:] + table[:, :-1]) / 2
     for shift in range(-reach, reach + 1):
@@ -147,27 +148,23 @@ def _difference(a: _Shape, b: _Shape) -> float:
     x, y = (s.values[:: round(step / s.step)] for s in (a, b))
     if len(x) > len(y):
         x, y = y, x
-    best = np.inf
-    least = 0.85 * len(y)
-    at = np.arange(len(x), dtype=float)
     reach = int(np.ceil(_CUT_S / step))
-    rough = {float(k): _apart(x, y, at, float(k), least) for k in range(-reach, reach + 1)}
-    nearest = min(rough, key=lambda k: rough[k])
-    for shift in np.linspace(nearest - 1, nearest + 1, 33).tolist():
-        best = min(best, _apart(x, y, at, shift, least))
-    return float(best)
+    whole = np.arange(-reach, reach + 1, dtype=float)
+    nearest = whole[np.argmin(_apart(x, y, whole))]
+    return float(_apart(x, y, np.linspace(nearest - 1, nearest + 1, 33)).min())
 
 
-def _apart(x: Floats, y: Floats, at: Floats, shift: float, least: float) -> float:
-    where = at + shift
-    inside = (where >= 1) & (where <= len(y) - 2.001)
-    inside[:2] = inside[-2:] = False  # the averages differ at a cut
-    if inside.sum() + 5 < least:
-        return float("inf")
-    difference = x[inside] - _cubic(y, where[inside])
-    difference -= difference.mean()
-    spread = float(x[inside].std())
-    return float(difference.std()) / spread if spread > 0 else float("inf")
+def _apart(x: Floats, y: Floats, shifts: Floats) -> Floats:
+    """The difference at each shift, shape (shifts,); infinite where too little is left."""
+    where = np.arange(len(x)) + shifts[:, None]
+    there = (where >= 1) & (where <= len(y) - 2.001)
+    there[:, :2] = there[:, -2:] = False  # the averages differ at a cut
+    count = there.sum(axis=1)
+    wanted = np.where(there, x, 0.0)
+    apart = np.where(there, x - _cubic(y, np.where(there, where, 1.0)), 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.sqrt(_variance(apart, count) / _variance(wanted, count))
+    return np.where((count + 5 >= _LEAST * len(y)) & np.isfinite(ratio), ratio, np.inf)
 
 
 def _cubic(values: Floats, at: Floats) -> Floats:
