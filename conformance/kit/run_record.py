@@ -11,7 +11,7 @@ import json
 import os
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, is_dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -88,12 +88,17 @@ def run_record(
 def catalogue_digest() -> str:
     """SHA-256, hex, of all requirements of this version of dexkit."""
     every = [
-        {k: str(v) if k in ("level", "kind", "plots") else v for k, v in asdict(r).items()}
+        {k: str(v) if k in ("level", "kind", "plots") else v for k, v in vars(r).items()}
         for layer in sorted(LAYERS)
         for r in catalogue(None, layer)
     ]
-    text = json.dumps(every, sort_keys=True, default=str)
+    text = json.dumps(every, sort_keys=True, default=_plain)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _plain(value: object) -> object:
+    """What JSON has no form for; without a copy of all that it has one for."""
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
 
 
 def recorded_dialect(run: Mapping[str, str]) -> str | None:
