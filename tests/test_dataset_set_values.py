@@ -28,7 +28,8 @@ def test_a_hand_that_closes_on_nothing_is_found() -> None:
     others = [grip(50.0 + i, 3.0) for i in range(5)]
     assert found([*others, grip(95.0, 0.0)], "grasp") == ["5"]
     assert found([*others, grip(52.0, 0.0)], "grasp") == []  # stopped where the others are
-    assert found([*others, grip(95.0, 0.0, closings=3)], "grasp") == []  # opens and closes
+    assert found([*others, grip(95.0, 0.0, closings=3)], "grasp") == ["5"]  # all there is to do
+    assert found([*others, grip(95.0, 0.5)], "grasp") == ["5"]  # it turned at once
     assert found([*others[:3], grip(95.0, 0.0)], "grasp") == []  # too few to say what is usual
     assert found([*others, *[grip(95.0, 0.0)] * 3], "grasp") == []  # not unusual
 
@@ -38,6 +39,14 @@ def test_gestures_of_both_hands_are_not_blamed() -> None:
     gesture = grip(95.0, 0.0) | grip(95.0, 0.0, hand="right hand")
     assert found([*both, gesture], "grasp") == []
     assert found([*both, grip(95.0, 0.0) | grip(55.0, 3.0, hand="right hand")], "grasp") == ["6"]
+    again = grip(95.0, 0.0, closings=3) | grip(55.0, 3.0, hand="right hand")
+    assert found([*both, again], "grasp") == []  # the other hand does the task
+
+
+def test_a_hand_that_never_holds_says_nothing_of_the_one_that_does() -> None:
+    idle = grip(60.0, 0.0, hand="right hand")
+    others = [grip(50.0 + i, 3.0) | idle for i in range(6)]
+    assert found([*others, grip(95.0, 0.0, closings=3) | idle], "grasp") == ["6"]
 
 
 def of_set(count: int = 6) -> tuple[dict[str, Judgement], list[dict[str, Floats]]]:

@@ -146,6 +146,20 @@ def test_one_joint_that_stays_is_found() -> None:
     assert only(changed(made(), "left_hand", state=stuck), "not-followed").joints == (4,)
 
 
+@pytest.mark.parametrize(("fingers", "most"), [(2, False), (7, True)])
+def test_few_fingers_may_be_hooked_for_a_moment(fingers: int, most: bool) -> None:
+    good, _ = holding("dex3-1")
+    at, until = round(9.1 * FPS), round(11.6 * FPS)  # it is told to open from 9 to 10 s
+
+    def hooked(state: Floats) -> Floats:
+        here = np.arange(state.shape[1]) >= state.shape[1] - fingers
+        noise = np.random.default_rng(3).normal(0, NOISE, (until - at, state.shape[1]))
+        state[at:until] = np.where(here, state[at], state[at:until]) + noise
+        return state
+
+    assert bool(found(changed(good, "left_hand", state=hooked), "not-followed")) is most
+
+
 # -- units -------------------------------------------------------------------------------------
 
 
@@ -338,11 +352,15 @@ def losing(track: Track, at: int) -> Track:
     return replace(track, state=track.state + way * (track.action - track.state) + noise)
 
 
-def holding(hand: str) -> tuple[Episode, int]:
-    """A hand that closes, holds an object from 2 to 9 s, and opens; and a frame in between."""
+def holding(hand: str, trembles: float = 0.0) -> tuple[Episode, int]:
+    """A hand that closes, holds an object from 2 to 9 s, and opens; and a frame in between.
+
+    :param trembles: parts of the way that its action goes to and fro.
+    """
     base = made(hand, arms=False, hands=("left_hand",))
     t = base.t
     told = np.interp(t, [1, 2, 9, 10], [0.05, 0.9, 0.9, 0.05])[:, None]
+    told = told + trembles * np.sin(9 * t)[:, None]
     track = base.tracks[0]
     assert track.limits is not None
     assert track.closing is not None
@@ -358,9 +376,10 @@ def holding(hand: str) -> tuple[Episode, int]:
     return replace(base, tracks=[track]), round(5.5 * FPS)
 
 
+@pytest.mark.parametrize("trembles", [0.0, 0.03])
 @pytest.mark.parametrize("hand", HANDS)
-def test_an_object_that_is_lost_is_found(hand: str) -> None:
-    good, at = holding(hand)
+def test_an_object_that_is_lost_is_found(hand: str, trembles: float) -> None:
+    good, at = holding(hand, trembles)
     assert blamed(good) == []
     fault = only(replace(good, tracks=[losing(good.tracks[0], at)]), "grasp")
     assert fault.part == "left_hand"

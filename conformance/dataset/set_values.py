@@ -17,6 +17,8 @@ __all__ = ["grasps_of_set", "statistics_of_set", "units_of_set"]
 _OTHERS = 4  # episodes with this hand closing, from which it is usual to hold something
 _USUAL = 0.8  # of them, that hold something
 _HELD_S = 0.4  # s: less is not held
+_BRIEF = 0.25  # of the time that others hold it: a hand that turns at once is short of its action
+_WORKS = 0.33  # of a set's episodes, in which a hand holds something that does a part of its task
 _FURTHER = 8.0  # % of its way that a hand closes further on nothing than on what others hold
 _ONE = (0.93, 1.05)  # where a joint that counts 0 to 1 ends
 _RADIANS = 1.8  # least end of the same joint in the other episodes, where it does not count so
@@ -28,7 +30,8 @@ _Found = Iterator[tuple[str, Finding]]
 def grasps_of_set(judgements: Mapping[str, Judgement]) -> _Found:
     """Episodes in which a hand closes on nothing, and holds something in all others.
 
-    A hand that opens and closes again and again, or two hands that hold nothing, are meant so.
+    Two hands that hold nothing are meant so. Where the other hand does the task, so is one that
+    opens and closes again and again; a hand that the set needs alone has not done it.
     """
     hands = dict.fromkeys(
         name.removesuffix(HOLDS)
@@ -36,24 +39,26 @@ def grasps_of_set(judgements: Mapping[str, Judgement]) -> _Found:
         for name in j.figures
         if name.endswith(HOLDS)
     )
+    times = {h: [j.figures.get(h + HOLDS, 0.0) for j in judgements.values()] for h in hands}
+    works = {h for h in hands if np.mean(np.array(times[h]) > _HELD_S) > _WORKS}
     for hand in hands:
         held = {
             name: (j.figures[hand + HOLDS], j.figures.get(hand + CLOSED, 0.0))
             for name, j in judgements.items()
             if hand + HOLDS in j.figures
         }
-        depths = [closed for seconds, closed in held.values() if seconds > _HELD_S]
-        empty = [name for name, (seconds, _) in held.items() if seconds == 0]
-        if len(held) <= _OTHERS or len(depths) < _USUAL * (len(held) - len(empty[:1])):
+        usual = [found for found in held.values() if found[0] > _HELD_S]
+        if len(held) <= _OTHERS or len(usual) < _USUAL * (len(held) - 1):
             continue
-        usual = float(np.median(depths))
-        for name in empty:
-            closed, figures = held[name][1], judgements[name].figures
-            others = [figures.get(other + HOLDS) for other in hands if other != hand]
+        time, depth = np.median(usual, axis=0).tolist()
+        others = works - {hand}
+        for name, (seconds, closed) in held.items():
+            figures = judgements[name].figures
             if (
-                closed < usual + _FURTHER
-                or figures.get(hand + CLOSINGS) != 1
-                or 0.0 in others
+                seconds > _BRIEF * time
+                or closed < depth + _FURTHER
+                or any(figures.get(other + HOLDS) == 0 for other in others)
+                or (others and figures.get(hand + CLOSINGS) != 1)
                 or judgements[name].use is Use.DROP
             ):
                 continue
@@ -63,10 +68,10 @@ def grasps_of_set(judgements: Mapping[str, Judgement]) -> _Found:
                     "grasp",
                     Use.REVIEW,
                     f"the {hand} closes on nothing, to {closed:.0f} % of its way; it holds "
-                    f"something at {usual:.0f} % in {len(depths)} of {len(held)} episodes",
+                    f"something at {depth:.0f} % in {len(usual)} of {len(held)} episodes",
                     part=hand.replace(" ", "_"),
                     value=round(closed, 1),
-                    limit=round(usual + _FURTHER, 1),
+                    limit=round(depth + _FURTHER, 1),
                     unit="%",
                 ),
             )

@@ -1,8 +1,9 @@
 """Whether hands and arms carry out what they are commanded.
 
 An object in a hand stops its joints in the closing direction, for as long as it is held; nothing
-stops them in the opening direction. So a state that stays more closed than any action of the last
-moments was not driven. Numbers that are exactly constant are another check's: the stream froze.
+stops a hand in the opening direction, or few of its fingers for a moment only. So a state that
+stays more closed than any action of the last moments was not driven. Numbers that are exactly
+constant are another check's: the stream froze.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ __all__ = ["CHECKS"]
 
 Mask = NDArray[np.bool_]
 
+_USED = 0.1  # strokes that a joint is asked to move, to be judged
 _LATE = 0.6  # s that a hand may take to begin: Inspire's take 0.4 behind a robot's network
 _SLOW = 0.4  # strokes a second, at least, of a hand that is driven: the slowest take 1.2 s
 _SHORT_HAND = 0.15  # strokes that a driven hand may be short: friction, weak gains, stiff skin
 _SHORT_ARM = 0.25  # rad that an arm may be short: gravity at a low gain, a table that it leans on
 _SECONDS = 0.5  # s, at least, that it is not driven, after all this
+_FEW_S = 2.0  # s, likewise, of few fingers: other fingers, or a handle, hold them for a moment
 _TOWARDS = 0.08  # strokes that a joint moves towards its action within these, if it is driven
 _MOST = 0.75  # of the joints that are asked
 _ASKED = 0.3  # strokes of closing that are asked of a hand that stays open, to count
@@ -43,7 +46,7 @@ _GAIN = 0.4  # of the action's motion: less is no joint that is driven, in free 
 def _followed(episode: Episode) -> Iterator[Finding | Figure]:
     shares = []
     for r in relations(episode):
-        asked = r.action_span > 0.1 * r.stroke
+        asked = r.action_span > _USED * r.stroke
         if r.increments or not asked.any():
             continue
         if other_units(r) is not None or misassigned(episode, r.part):
@@ -74,6 +77,8 @@ def _finding(r: Relation, bad: Mask, weak: NDArray[np.bool_]) -> Finding | None:
         if np.ptp(r.state[begin:end, joint]) > 0 and not _action_stuck(r, joint, begin, end)
     ]
     whole = np.flatnonzero(weak).tolist()
+    if r.track.is_hand and _hooked(r, found):
+        found = [(b, e, j) for b, e, j in found if (e - b) * r.step > _FEW_S]
     joints = sorted({j for _, _, j in found} | set(whole))
     if not joints:
         return None
@@ -108,6 +113,20 @@ def _finding(r: Relation, bad: Mask, weak: NDArray[np.bool_]) -> Finding | None:
         value=away,
         unit=_unit(r).strip(),
     )
+
+
+def _hooked(r: Relation, found: list[tuple[int, int, int]]) -> bool:
+    """Whether few fingers of a hand are concerned, and the others do what they are asked."""
+    used = r.action_span > _USED * r.stroke
+    joints = sorted({j for _, _, j in found})
+    if not joints or 2 * len(joints) >= used.sum():
+        return False
+    begin, end = min(b for b, _, _ in found), max(e for _, e, _ in found)
+    during = slice(max(0, begin - round(_LATE / r.step)), end)
+    told, done = np.ptp(r.action[during], axis=0), np.ptp(r.state[during], axis=0)
+    others = np.flatnonzero(told > 2 * _USED * r.stroke)
+    others = others[~np.isin(others, joints)]
+    return bool((done[others] > _GAIN * told[others]).mean() > 0.5) if len(others) else True
 
 
 def _backwards(r: Relation) -> Finding | None:

@@ -38,7 +38,9 @@ _PART = 0.5  # of what it was short of its action
 _LEFT = 0.25  # of the pressure, or the torque, that is left when nothing is held
 _CLEAR = 6.0  # times the noise, that a pressure is to be one
 _BEST = np.minimum, np.maximum
-_STEADY = 0.02  # strokes that a steady action changes
+_STEADY = 0.02  # strokes that a steady action changes; ``_LITTLE`` of what its hand does meanwhile,
+# which tremor and a slow hand's way may be, and no cause
+_LITTLE = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +145,7 @@ def _closes_on(r: Relation, grip: _Grip) -> tuple[int, str] | None:
     before = grip.holds[at - wide] & (came < _STEADY)
     gap = (grip.asked - grip.closed)[at - wide]
     went = grip.closed[at] - grip.closed[at - wide]
-    same = _steady(r, grip, at, wide, wide // 2)
+    same = _steady(r, grip, at, wide, wide // 2, np.maximum(_STEADY, _LITTLE * went))
     found = before & same & (went > np.maximum(_PART * gap, _MOVES)) & (gap > _MOVES)
     left = (grip.told - grip.closed)[at + wide // 2]
     found &= left < (1 - _PART) * gap
@@ -154,13 +156,18 @@ def _closes_on(r: Relation, grip: _Grip) -> tuple[int, str] | None:
 
 
 def _steady(
-    r: Relation, grip: _Grip, at: NDArray[np.intp], wide: int, after: int
+    r: Relation,
+    grip: _Grip,
+    at: NDArray[np.intp],
+    wide: int,
+    after: int,
+    most: Floats | float = _STEADY,
 ) -> NDArray[np.bool_]:
     """Whether the action stays as it is, before, while and for some frames ``after`` it is lost."""
     late = max(0, r.lag) + round(0.3 / r.step)
     told = grip.told[:, None]
     low, high = (running(told, wide + late, after, best)[at, 0] for best in _BEST)
-    return np.asarray(high - low < _STEADY)
+    return np.asarray(high - low < most)
 
 
 def _lets_go(episode: Episode, r: Relation, grip: _Grip) -> tuple[int, str] | None:
