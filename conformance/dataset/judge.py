@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +33,7 @@ from dexkit.conformance.dataset.likeness import shape_of
 from dexkit.conformance.dataset.motion import span
 from dexkit.hand import Floats
 
-__all__ = ["CHECKS", "TITLES", "VERSION", "checks_digest", "judge"]
+__all__ = ["CHECKS", "TITLES", "checks_digest", "judge"]
 
 CHECKS: tuple[Check, ...] = (
     *frozen.CHECKS,
@@ -50,8 +52,6 @@ CHECKS: tuple[Check, ...] = (
 """Every check of a single episode."""
 TITLES = {check.name: check.title for check in CHECKS} | OF_SETS
 """What each check looks for, those of :mod:`~dexkit.conformance.dataset.across` included."""
-VERSION = 1
-"""Goes up when a check judges differently; an audit then judges again."""
 
 Frames = NDArray[np.intp]
 
@@ -74,11 +74,15 @@ _POINTS = 160  # of a curve
 _AROUND = 1.0  # s that a curve shows before and after its finding
 
 
+@cache
 def checks_digest() -> str:
-    """What verdicts depend on besides the episode: the checks and their version, and what pictures
-    can be decoded with.
+    """What verdicts depend on besides the episode: the code of the checks, and what pictures can be
+    decoded with.
     """
-    return " ".join([str(VERSION), *(check.name for check in CHECKS), *decoders()])
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return " ".join([digest.hexdigest()[:16], *decoders()])
 
 
 def judge(episode: Episode) -> Judgement:
