@@ -406,3 +406,14 @@ def test_pressure_that_falls_in_a_closed_hand_is_found(field: str) -> None:
     assert blamed(with_field(values)) == []
     gone = np.where(np.arange(n)[:, None] > at, level + noise, values)
     assert only(with_field(gone), "grasp").part == "left_hand"
+
+
+def test_joints_whose_names_say_nothing_may_be_a_hand() -> None:
+    def is_hand(*joints: str, part: str = "robot") -> bool:
+        return Track(part, joints).is_hand
+
+    assert is_hand("joint_0", "joint_1")  # an object may stop them
+    assert is_hand("a", part="robot_hand")
+    assert not is_hand("left_shoulder_pan.pos", "joint_1")
+    assert not is_hand("kLeftElbow", part="left_arm")
+    assert not is_hand("waist_yaw_joint")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,6 +16,12 @@ from dexkit.traces.sessions.model import Camera
 from dexkit.traces.sessions.streams import HAND
 
 __all__ = ["Episode", "Gap", "Track"]
+
+_LIMBS = (
+    *("arm", "shoulder", "elbow", "wrist", "waist", "torso", "body", "leg", "hip", "knee", "ankle"),
+    *("head", "neck"),
+)
+"""Parts of words in the names of joints of arms and bodies."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +61,16 @@ class Track:
         specs = self._specs
         return None if specs is None else np.array([s.dq_max for s in specs])
 
-    @property
+    @cached_property
     def is_hand(self) -> bool:
-        """Whether it is a hand or a gripper."""
-        return self.model is not None or self.part.endswith(HAND)
+        """Whether it is a hand or a gripper, or may be one: nothing in its names says otherwise.
+
+        An object may stop it.
+        """
+        if self.model is not None or self.part.endswith(HAND):
+            return True
+        words = re.findall(r"[a-z]+", " ".join((self.part, *self.joints)).lower())
+        return not any(limb in word for word in words for limb in _LIMBS)
 
     @property
     def closing(self) -> Floats | None:

@@ -878,6 +878,7 @@ def _bare(name: str, side: Side) -> str:
 
 def _part_of(name: str) -> str:
     side, words = _side(name), _words(name)
+    is_hand = bool(_OF_HANDS & set(words))
     if side is None:
-        return "robot"
-    return f"{side}{HAND}" if _OF_HANDS & set(words) else f"{side}_arm"
+        return f"robot{HAND}" if is_hand else "robot"
+    return f"{side}{HAND}" if is_hand else f"{side}_arm"

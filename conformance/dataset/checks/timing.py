@@ -45,8 +45,7 @@ _LATEST_QUICK_S = (
 _QUICK_HZ = 150.0
 _LATEST_ARM_S = 0.4  # arms that swing are 0.2 s behind
 _EARLY_FRAMES = 2.5  # that a state may be before its action: the next state is the action
-_APART_HANDS_S = 0.4  # that one of two equal hands may be later than the other
-_APART_ARMS_S = 0.25
+_APART_S = 0.4  # that one of two equal parts may be later than the other: one may only tremble
 _LEAST_SURE = 0.55  # correlation in a third of an episode, in which a drift smears it
 _DRIFT_FRAMES = 3.0
 _DRIFT_S = 0.09
@@ -310,11 +309,10 @@ def _apart(lags: dict[str, tuple[Track, Lag]]) -> Iterator[Finding]:
     """Two equal parts of which one is later."""
     for part, (track, lag) in lags.items():
         other = lags.get(part.replace("left", "right")) if part.startswith("left") else None
-        if other is None or min(lag.correlation, other[1].correlation) < _FIRM:
+        if other is None or min(lag.correlation, other[1].correlation) < _SHARP:
             continue
         apart = lag.seconds - other[1].seconds
-        limit = _APART_HANDS_S if track.is_hand else _APART_ARMS_S
-        if abs(apart) > limit:
+        if abs(apart) > _APART_S:
             late = track if apart > 0 else other[0]
             yield Finding(
                 "out-of-step",
@@ -323,7 +321,7 @@ def _apart(lags: dict[str, tuple[Track, Lag]]) -> Iterator[Finding]:
                 "action than that of the other side",
                 late.part,
                 value=round(abs(apart), 3),
-                limit=limit,
+                limit=_APART_S,
                 unit="s",
             )
 
