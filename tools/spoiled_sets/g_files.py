@@ -130,7 +130,7 @@ SAMPLES = {
 # N·m a rad, or share of the force a unit of travel, of action minus state
 STIFFNESS = {"dex1-1": 0.9, "dex3-1": 1.5, "dex5-1": 1.1, "brainco-revo2": 2.2, "inspire-ftp": 2.4}
 # fastest motion of a hand in full strokes a second
-FASTEST = {"dex1-1": 1.25, "dex3-1": 3.5, "dex5-1": 2.4, "brainco-revo2": 1.9, "inspire-ftp": 1.8}
+FASTEST = {"dex1-1": 1.9, "dex3-1": 3.5, "dex5-1": 2.4, "brainco-revo2": 1.9, "inspire-ftp": 1.8}
 HOME = np.array([0.15, 0.2, 0.05, 0.55, 0.0, 0.0, 0.0])
 REACH = np.array([0.45, 0.22, 0.3, 0.42, 0.3, 0.22, 0.24])
 SIGNS = {"left": np.ones(7), "right": np.array([1, -1, -1, 1, -1, 1, -1.0])}
@@ -177,9 +177,12 @@ def strokes(model: str, side: str) -> tuple[Floats, ...]:
         elif low is not None and way[i] >= 0.72 and way[i] >= way[i : i + 12].max() - 1e-3:
             piece = np.concatenate([rest[None], table[low : i + 1]])
             at = np.linspace(0, len(piece) - 1, 61)
-            found.append(
-                np.stack([np.interp(at, np.arange(len(piece)), c) for c in piece.T], axis=1)
-            )
+            path = [np.interp(at, np.arange(len(piece)), c) for c in piece.T]
+            padded = [np.concatenate([np.full(9, c[0]), c, np.full(9, c[-1])]) for c in path]
+            smooth = [np.convolve(c, np.ones(19) / 19, "valid") for c in padded]
+            for c, d in zip(smooth, path, strict=True):
+                c += np.interp(np.arange(61), [0, 60], [d[0] - c[0], d[-1] - c[-1]])
+            found.append(np.stack(smooth, axis=1))
             low = None
     return tuple(found)
 
@@ -198,7 +201,11 @@ class Side:
     held: list[tuple[float, float, float]]
 
 
-def plan(rng: Rng, seconds: float, style: dict[str, Any], side: str) -> Side:
+# A gripper's stroke is long: its operators take more time.
+_LONGER = {"dex1-1": 0.25}
+
+
+def plan(rng: Rng, seconds: float, style: dict[str, Any], side: str, model: str) -> Side:
     """Reach, grasp, carry, put down, return, again and again."""
     pace = style.get("pace", 1.0)
     moves, grips, held = [], [], []
@@ -217,7 +224,7 @@ def plan(rng: Rng, seconds: float, style: dict[str, Any], side: str) -> Side:
         far = HOME + rng.normal(0, 1, 7) * REACH
         far[3] = abs(far[3] - 0.4) + 0.35
         t += go(rng.uniform(0.8, 1.5) / pace, far) * 0.92
-        close = rng.uniform(0.45, 0.9) / pace
+        close = (rng.uniform(0.45, 0.9) + _LONGER.get(model, 0.0)) / pace
         strong = style.get("strong", 1.0) * rng.uniform(0.93, 1.0)
         begin = t
         if hand and not style.get("only_opens"):
@@ -231,11 +238,13 @@ def plan(rng: Rng, seconds: float, style: dict[str, Any], side: str) -> Side:
             finish = begin + close + (t - begin - close) * rng.uniform(0.35, 0.5) if drop else t
             held.append((begin, finish if drop else t + 9.0, size))
         if hand:
-            opened = rng.uniform(0.35, 0.7) / pace
+            opened = (rng.uniform(0.35, 0.7) + _LONGER.get(model, 0.0)) / pace
             back = style.get("half_open", 0.0) * rng.uniform(0.6, 1.3)
             grips.append((t, t + opened, back))
             if held and not drop and held[-1][0] == begin:
-                held[-1] = (begin, t + opened, size)
+                # it is out of reach when the last finger has let go
+                gone = opened + 0.4 + style.get("roll", 0.1) + style.get("lag", 0.0)
+                held[-1] = (begin, t + gone, size)
             t += opened
         t += go(rng.uniform(0.7, 1.2) / pace, HOME + rng.normal(0, 0.25, 7) * REACH)
         t += rng.uniform(0.05, 0.3) / pace
@@ -321,7 +330,8 @@ def make(made: Set, style: dict[str, Any], seed: int, alike: int = 0) -> Take:
     frames = np.round(np.arange(round(seconds * hz)) / hz * RATE).astype(int)
     tracks, touch, seen, spans, until = {}, {}, [], {}, 0.0
     for side in SIDES:
-        todo = plan(rng, seconds - sum(x for _, x in style.get("pauses", ())), style, side)
+        todo = plan(rng, seconds - sum(x for _, x in style.get("pauses", ())), style, side,
+                    made.model)  # fmt: skip
         if alike:
             todo = _again(own, todo)
         spans[side] = todo.held
@@ -340,6 +350,8 @@ def make(made: Set, style: dict[str, Any], seed: int, alike: int = 0) -> Take:
             unit = 0.0005 if kind == "arm" else 0.0008
             e = effort if kind == "hand" else 14.0 * (a - x)
             read = x[frames] + own.normal(0, unit * noise, x[frames].shape)
+            if kind == "hand" and made.model not in ("dex1-1", "dex3-1", "dex5-1"):
+                read = np.clip(read, 0, 1)
             step = style.get("step", {}).get(kind, 0.0002 if kind == "arm" else 0.001)
             v = np.gradient(x, 1 / RATE, axis=0)[frames]
             tracks[f"{side}_{kind}"] = Track(
@@ -430,24 +442,27 @@ def _hand(
 
 
 def piece(made: Set, style: dict[str, Any], seed: int) -> Take:
-    """A piece of a sample of the gripper, actions and states as they were, warped in time."""
+    """Pieces of samples of the gripper, actions and states as they were, warped in time.
+
+    Each side has a piece of its own unless ``style`` names the one of both.
+    """
     rng = np.random.default_rng(seed)
-    name = style.get("from", ("dex1_pick_place", "dex1_idle_then_startle", "dex1_legacy_v1_1",
-                              "dex1_hand_dropout")[seed % 4])  # fmt: skip
-    source = sampled(name)
-    warp = style.get("warp", float(rng.uniform(0.85, 1.6)))
+    names = ("dex1_pick_place", "dex1_idle_then_startle", "dex1_legacy_v1_1", "dex1_hand_dropout")
     hz = style.get("hz", made.fps)
-    low = {"dex1_idle_then_startle": 7.5, "dex1_hand_dropout": 0.8}.get(name, 1.2)
-    whole = len(source["action"]) / 60
-    seconds = min(style.get("seconds", float(rng.uniform(7, 12))), (whole - low - 0.3) * warp)
-    begin = style.get("begin", float(rng.uniform(low, whole - seconds / warp - 0.1)))
-    at = (begin + np.arange(round(seconds * hz)) / hz / warp) * 60
-    grid = np.arange(len(source["action"]))
-    swap = style.get("swap", bool(rng.integers(2)))
+    seconds = style.get("seconds", float(rng.uniform(7, 11)))
     tracks = {}
     for s, side in enumerate(SIDES):
-        c = 1 - s if swap else s
-        get = {k: np.interp(at, grid, v[:, c])[:, None] for k, v in source.items()}
+        name = style.get("from", names[int(rng.integers(4))])
+        source = sampled(name)
+        low = {"dex1_idle_then_startle": 7.5, "dex1_hand_dropout": 0.8}.get(name, 1.2)
+        whole = len(source["action"]) / 60 - 0.2
+        warp = style.get("warp", float(rng.uniform(0.85, 1.6)))
+        warp = max(warp, seconds / (whole - low))
+        begin = style.get("begin", float(rng.uniform(low, max(low, whole - seconds / warp))))
+        column = s if "from" in style else int(rng.integers(2))
+        at = (begin + np.arange(round(seconds * hz)) / hz / warp) * 60
+        grid = np.arange(len(source["action"]))
+        get = {k: np.interp(at, grid, v[:, column])[:, None] for k, v in source.items()}
         state = get["observation.state"]
         tracks[f"{side}_hand"] = Track(
             get["action"],
