@@ -368,7 +368,8 @@ def make(made: Set, style: dict[str, Any], seed: int, alike: int = 0) -> Take:
         across = np.tanh(0.8 * (arm[:, 2] + 0.6 * arm[:, 1]))
         base = 30 if side == "left" else 64
         y = 38 + 26 * np.tanh(0.9 * (arm[:, 0] - 0.5 * (arm[:, 3] - 0.6)))
-        r = 9 - 4 * np.clip(np.abs(hand - hand[0]).mean(axis=1), 0, 1)
+        stroke = 5.4 if made.model == "dex1-1" else 1.0
+        r = 9 - 4 * np.clip(np.abs(hand - hand[0]).mean(axis=1) / stroke, 0, 1)
         seen.append(np.stack([base + 24 * across, y, r], axis=1)[frames])
     take = Take(
         {p: tracks[p] for p in made.parts},
