@@ -544,7 +544,7 @@ def fingers() -> Plan:
         good("A knob is held for 15 s.", hold=15.0, seconds=21.0),
         good("A soft knob.", soft=0.4, seconds=8.0),
         good("Hands that begin closed and only open.", closed_first=1.0, only_opens=True,
-             object=False, seconds=7.0),
+             object=False, seconds=4.5, carries=0, hold=0.1, pace=1.4),
         bad("wrong_fps", "The loop ran at 25 Hz, the dataset says 50; velocities tell.",
             {"seconds": 9.0, "hz": 25}),
         bad("wrong_fps", "The loop ran at 30 Hz, the dataset says 50; velocities tell.",

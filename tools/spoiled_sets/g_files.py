@@ -461,14 +461,21 @@ def piece(made: Set, style: dict[str, Any], seed: int) -> Take:
         warp = max(warp, seconds / (whole - low))
         begin = style.get("begin", float(rng.uniform(low, max(low, whole - seconds / warp))))
         column = s if "from" in style else int(rng.integers(2))
-        at = (begin + np.arange(round(seconds * hz)) / hz / warp) * 60
+        t = np.arange(round(seconds * hz)) / hz
+        sway, turn = float(rng.uniform(0.1, 0.3)), 2 * np.pi / float(rng.uniform(4, 7))
+        share, phase = float(rng.uniform(0.8, 1.0)), float(rng.uniform(0, 2 * np.pi))
+        if "from" in style:
+            sway, share = 0.0, 1.0
+        # no operator repeats a stroke at the same pace and of the same width
+        at = 60 * (begin + t / warp + sway * (np.sin(turn * t + phase) - np.sin(phase)))
+        pace = (1 / warp + sway * turn * np.cos(turn * t + phase))[:, None]
         grid = np.arange(len(source["action"]))
         get = {k: np.interp(at, grid, v[:, column])[:, None] for k, v in source.items()}
-        state = get["observation.state"]
+        action, state = (5.4 - share * (5.4 - get[k]) for k in ("action", "observation.state"))
         tracks[f"{side}_hand"] = Track(
-            get["action"],
+            action,
             np.round((state + rng.normal(0, 0.0015, state.shape)) * 1000) / 1000,
-            get["observation.velocity"] / warp + rng.normal(0, 0.012, state.shape),
+            get["observation.velocity"] * share * pace + rng.normal(0, 0.012, state.shape),
             get["observation.effort"] + rng.normal(0, 0.006, state.shape),
         )
     n = len(at)
