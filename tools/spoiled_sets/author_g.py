@@ -508,7 +508,7 @@ def touch() -> Plan:
         good("Arms rest on the table while the hands grasp.", arms="none", carries=0, hold=1.5),
         good("A very quick operator.", pace=1.8),
         good("Only the right hand grasps.", hands="right"),
-        good("The hands only just press.", strong=0.74, size=0.6),
+        good("The hands close to three quarters only and press little.", strong=0.74, size=0.6),
         good("Episode 2 once more: alike, not a copy.", like=2),
         bad("grasp_on_nothing", "The right hand closes on nothing each time.", long, side="right"),
         bad("grasp_on_nothing", "The left hand closes on nothing each time.",
