@@ -158,7 +158,7 @@ def verdicts(folder: Path, path: Path) -> Path:
 def test_lerobot_reads_every_kept_frame_as_it_was(tmp_path: Path, made: Any) -> None:
     whole, less, by_lerobot = (tmp_path / name for name in ("whole", "less", "by_lerobot"))
     made(whole)
-    dexkit("export", whole, less, "--drop", verdicts(whole, tmp_path / "episodes.json"))
+    dexkit("export", whole, "--out", less, "--drop", verdicts(whole, tmp_path / "episodes.json"))
     before, after = read(whole), read(less)
     assert (before["episodes"], after["episodes"]) == (5, 3)
     rows = without(before, DROPPED)

@@ -247,7 +247,7 @@ def test_the_other_episodes_stay_bit_for_bit(tmp_path: Path, version: str, video
     before = {p: p.read_bytes() for p in source.rglob("*") if p.is_file()}
     found = {n: "drop" if n in DROPPED else "keep" for n in range(7)}
     file = verdicts(tmp_path / "e.json", source, found)
-    code, output = dexkit("export", source, out, "--drop", file)
+    code, output = dexkit("export", source, "--out", out, "--drop", file)
     stray = version == "v3.0" and not videos  # the files are there, and no feature names them
     assert code == stray, output
     assert "4 episodes kept, 3 dropped" in output
@@ -294,7 +294,7 @@ def test_the_other_episodes_stay_bit_for_bit(tmp_path: Path, version: str, video
 @each("version", ["v2.0", "v2.1", "v3.0"])
 def test_statistics_are_those_of_the_episodes_that_stay(tmp_path: Path, version: str) -> None:
     source, out = made(tmp_path / "set", version), tmp_path / "out"
-    code, output = dexkit("export", source, out, "--drop", "1,2,5")
+    code, output = dexkit("export", source, "--out", out, "--drop", "1,2,5")
     assert code == 0, output
     tables = [table for _, table in sorted(data(out).items())]
     expected = own_statistics(pa.concat_tables(tables))
@@ -338,7 +338,7 @@ def test_statistics_are_taken_from_the_frames(tmp_path: Path, at_once: int) -> N
         pq.write_table(table.drop(lost), path)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dexkit.traces.sessions.lerobot_cleaned._VALUES_AT_ONCE", at_once)
-        code, output = dexkit("export", source, out, "--drop", "0")
+        code, output = dexkit("export", source, "--out", out, "--drop", "0")
     assert code == 0, output
     found = json.loads((out / "meta/stats.json").read_text())
     expected = own_statistics(pa.concat_tables(data(out).values()))
@@ -368,7 +368,7 @@ def test_aggregated_statistics_are_those_of_all_frames() -> None:
 def test_review_is_dropped_only_if_asked(tmp_path: Path) -> None:
     source = made(tmp_path / "set", "v2.1")
     file = verdicts(tmp_path / "e.json", source, {0: "keep", 2: "review", 4: "drop"})
-    code, output = dexkit("export", source, tmp_path / "a", "--drop", file)
+    code, output = dexkit("export", source, "--out", tmp_path / "a", "--drop", file)
     assert (code, "6 episodes kept, 1 dropped" in output) == (0, True), output
     assert "4 episodes that were not judged are kept" in output
     to = ("--out", tmp_path / "b", "--drop", file, "--set", "drop=review", "--json")
@@ -378,7 +378,7 @@ def test_review_is_dropped_only_if_asked(tmp_path: Path) -> None:
     assert (found["kept"], [d["episode"] for d in found["dropped"]]) == (5, ["2", "4"])
     check_equal(source, tmp_path / "b", [0, 1, 3, 5, 6])
     # a second time, of what is left
-    code, output = dexkit("export", tmp_path / "b", tmp_path / "c", "--drop", "0,4")
+    code, output = dexkit("export", tmp_path / "b", "--out", tmp_path / "c", "--drop", "0,4")
     assert code == 0, output
     check_equal(source, tmp_path / "c", [1, 3, 5])
 
@@ -387,7 +387,7 @@ def test_frames_are_numbered_in_the_order_of_the_files(tmp_path: Path) -> None:
     """LeRobot reads all files of v3.0 by name, and finds frames by their place."""
     files = [[3, 4], [6], [0, 1, 2], [5]]
     source, out = made(tmp_path / "set", "v3.0", files=files), tmp_path / "out"
-    code, output = dexkit("export", source, out, "--drop", "1,4")
+    code, output = dexkit("export", source, "--out", out, "--drop", "1,4")
     assert code == 0, output
     read = [pq.read_table(path) for path in sorted((out / "data").rglob("*.parquet"))]
     assert pa.concat_tables(read)["index"].to_pylist() == [*range(sum(LENGTHS) - 9)]
@@ -406,7 +406,7 @@ def test_a_set_of_dexkits_export_keeps_its_origins(tmp_path: Path) -> None:
         cut(trace, path, spans=[Span(begin, begin + 10**9 // 4)])
     source = tmp_path / "set"
     assert dexkit("export", *paths, "--to", "lerobot", "--out", source)[0] == 0
-    code, output = dexkit("export", source, tmp_path / "out", "--drop", "0,2")
+    code, output = dexkit("export", source, "--out", tmp_path / "out", "--drop", "0,2")
     assert code == 0, output
     check_equal(source, tmp_path / "out", [1, 3])
     found = json.loads((tmp_path / "out/meta/info.json").read_text())["dexkit"]["sessions"]
@@ -433,7 +433,7 @@ def test_episodes_of_xr_teleoperate_keep_their_names(tmp_path: Path) -> None:
     put(source / ".git" / "HEAD", "x")
     found = {"episode_0001": "drop", "episode_0000": "keep"}
     file = verdicts(tmp_path / "e.json", source, found)
-    code, output = dexkit("export", source, out, "--drop", file)
+    code, output = dexkit("export", source, "--out", out, "--drop", file)
     assert code == 0, output
     assert "3 episodes kept, 1 dropped" in output
     assert "gaps in the numbers" in output
@@ -470,7 +470,7 @@ def test_a_folder_of_sets_is_written_as_one(tmp_path: Path) -> None:
         ],
     }
     put(tmp_path / "e.json", json.dumps(document))
-    code, output = dexkit("export", source, out, "--drop", tmp_path / "e.json")
+    code, output = dexkit("export", source, "--out", out, "--drop", tmp_path / "e.json")
     assert code == 0, output
     assert "8 episodes kept, 13 dropped" in output
     assert "a: no episode of it is left" in output
@@ -501,7 +501,9 @@ def test_what_an_audit_cannot_read_is_dropped(tmp_path: Path) -> None:
             entry["verdict"] = "keep"
     edited = {"format": "dexkit-episodes", "version": 1, "episodes": found}
     put(out / "episodes.json", json.dumps(edited))
-    code, output = dexkit("export", source, tmp_path / "out", "--drop", out / "episodes.json")
+    code, output = dexkit(
+        "export", source, "--out", tmp_path / "out", "--drop", out / "episodes.json"
+    )
     assert code == 0, output
     assert (tmp_path / "out/task/0003").is_dir()
     check = data(tmp_path / "out" / "set")
@@ -520,35 +522,35 @@ def test_what_cannot_be_dropped_is_refused_and_nothing_is_written(tmp_path: Path
     folder = verdicts(tmp_path / "folder.json", xr, {"episode_0009": "drop"})
     whole = verdicts(tmp_path / "whole.json", xr, {".": "drop"})
     for arguments, why in [
-        ((source, out, "--drop", lacking), "has no episode 9"),
-        ((source, out, "--drop", "9"), "has no episode 9"),
-        ((xr, out, "--drop", folder), "has no episode_0009"),
-        ((xr, out, "--drop", whole), "has no task"),
-        ((xr, out, "--drop", good), f"it is about set ({source}), other (/no/such/set)"),
-        ((xr, out, "--drop", "1"), "is no LeRobot dataset"),
-        ((source, out, "--drop", "0,1,2,3,4,5,6"), "would be left"),
-        ((source, source / "x" / "out", "--drop", good), "lies in"),
-        ((source, xr, "--drop", good), "exists"),
+        ((source, "--out", out, "--drop", lacking), "has no episode 9"),
+        ((source, "--out", out, "--drop", "9"), "has no episode 9"),
+        ((xr, "--out", out, "--drop", folder), "has no episode_0009"),
+        ((xr, "--out", out, "--drop", whole), "has no task"),
+        ((xr, "--out", out, "--drop", good), f"it is about set ({source}), other (/no/such/set)"),
+        ((xr, "--out", out, "--drop", "1"), "is no LeRobot dataset"),
+        ((source, "--out", out, "--drop", "0,1,2,3,4,5,6"), "would be left"),
+        ((source, "--out", source / "x" / "out", "--drop", good), "lies in"),
+        ((source, "--out", xr, "--drop", good), "exists"),
         ((source, "--drop", good), "one folder to write"),
-        ((source, out, out, "--drop", good), "one folder to write"),
-        ((source, out, "--drop", tmp_path / "none.json"), "cannot read"),
-        ((source, out, "--drop", "1,"), "cannot read"),
-        ((source, out, "--drop", "1", "--set", "drop=review"), "file of verdicts"),
-        ((source, out, "--drop", good, "--to", "lerobot"), "own format"),
-        ((source, out, "--drop", good, "--set", "fps=3"), "own format"),
+        ((source, out, "--out", out, "--drop", good), "one folder to write"),
+        ((source, "--out", out, "--drop", tmp_path / "none.json"), "cannot read"),
+        ((source, "--out", out, "--drop", "1,"), "cannot read"),
+        ((source, "--out", out, "--drop", "1", "--set", "drop=review"), "file of verdicts"),
+        ((source, "--out", out, "--drop", good, "--to", "lerobot"), "own format"),
+        ((source, "--out", out, "--drop", good, "--set", "fps=3"), "own format"),
         ((source, out), f"dexkit export {source} --out DIR --drop episodes.json"),
         ((source, "--to", "lerobot", "--out", out), "--drop episodes.json"),
         ((xr, "--to", "episodes"), "--drop episodes.json"),
         ((tmp_path / "e.mcap", "--to", "lerobot"), "--out is missing"),
-        ((tmp_path, out, "--drop", "0"), "is no LeRobot dataset"),
-        ((tmp_path / "nothing", out, "--drop", good), "is no folder"),
+        ((tmp_path, "--out", out, "--drop", "0"), "is no LeRobot dataset"),
+        ((tmp_path / "nothing", "--out", out, "--drop", good), "is no folder"),
     ]:
         code, output = dexkit("export", *arguments)
         assert (code, why in output) == (2, True), (arguments, output)
         assert not out.exists()
     # a link to the set is the set
     (tmp_path / "link").symlink_to(source)
-    assert dexkit("export", tmp_path / "link", out, "--drop", good)[0] == 0
+    assert dexkit("export", tmp_path / "link", "--out", out, "--drop", good)[0] == 0
 
 
 @each(
@@ -583,7 +585,7 @@ def test_hostile_verdicts_are_refused(tmp_path: Path, change: dict[str, Any], wh
     key = next(iter(change))
     (found if key in found else found["episodes"][0]).update(change)
     path.write_bytes(change.get("text", json.dumps(found)).encode("utf-8", "surrogatepass"))
-    code, output = dexkit("export", source, out, "--drop", path)
+    code, output = dexkit("export", source, "--out", out, "--drop", path)
     assert (code, why in output) == (2, True), output
     assert not out.exists()
 
@@ -650,7 +652,7 @@ def test_hostile_datasets_are_refused_whole(tmp_path: Path, version: str, what: 
     source, out = made(tmp_path / "set", version), tmp_path / "out"
     change, why = HOSTILE[what]
     change(source)
-    code, output = dexkit("export", source, out, "--drop", "0,2")
+    code, output = dexkit("export", source, "--out", out, "--drop", "0,2")
     assert (code, why in output) == (2, True), output
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
 
@@ -665,7 +667,7 @@ def test_a_list_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
         source = made(tmp_path / f"set{name}{len(text)}", "v2.1")
         with open(source / f"meta/{name}.jsonl", "a") as file:
             file.write(text)
-        code, output = dexkit("export", source, tmp_path / "out", "--drop", "0")
+        code, output = dexkit("export", source, "--out", tmp_path / "out", "--drop", "0")
         assert (code, f"{name}.jsonl, line 8" in output) == (2, True), output
         assert not (tmp_path / "out").exists()
 
@@ -676,7 +678,7 @@ def test_broken_files_of_dropped_episodes_are_no_obstacle(tmp_path: Path) -> Non
         put(source / f"data/{name}.parquet", "broken")
         kept = [n for n in range(7) if n != (1 if version == "v2.1" else 5)]
         gone = "1" if version == "v2.1" else "5"
-        code, output = dexkit("export", source, out, "--drop", gone)
+        code, output = dexkit("export", source, "--out", out, "--drop", gone)
         assert code == 0, output
         after = data(out)
         assert [len(after[n]) for n in range(6)] == [LENGTHS[n] for n in kept]
@@ -691,7 +693,7 @@ def test_what_is_wrong_and_what_is_no_part_of_a_set_is_told(tmp_path: Path) -> N
     put_lines(source / "meta/episodes.jsonl", rows)
     odd = b"odd\xff\x1b[31m".decode("utf-8", "surrogateescape")
     put(source / odd, "odd")
-    code, output = dexkit("export", source, out, "--drop", "0")
+    code, output = dexkit("export", source, "--out", out, "--drop", "0")
     assert code == 1, output
     assert "videos that are missing: videos/chunk-001/" in output
     assert "no episode names it: data/chunk-000/episode_000099.parquet" in output
@@ -705,7 +707,7 @@ def test_an_empty_column_of_numbers_is_that_of_the_file(tmp_path: Path) -> None:
     source, out = made(tmp_path / "set", "v2.0"), tmp_path / "out"
     for path in (source / "data").rglob("*.parquet"):
         pq.write_table(pq.read_table(path).drop(["episode_index", "index"]), path)
-    code, output = dexkit("export", source, out, "--drop", "0")
+    code, output = dexkit("export", source, "--out", out, "--drop", "0")
     assert code == 0, output
     one, two = Dataset(source).read(4), Dataset(out).read(3)
     values = [s.parts[0].values["state"]["q"] for s in (one, two)]
@@ -750,7 +752,17 @@ def test_a_dataset_is_never_whole_in_memory(tmp_path: Path) -> None:
         "finally: print('peak', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program, "export", str(root), str(tmp_path / "out"), "--drop", "0"],
+        [
+            sys.executable,
+            "-c",
+            program,
+            "export",
+            str(root),
+            "--out",
+            str(tmp_path / "out"),
+            "--drop",
+            "0",
+        ],
         capture_output=True,
         text=True,
         check=True,

@@ -180,8 +180,7 @@ def _cleaned(
     from dexkit.traces.sessions.verdicts import read_verdicts
 
     source, *others = sessions
-    targets = others if out is None else [out, *others]
-    if len(targets) != 1:
+    if others or out is None:
         raise UsageError(
             "--drop takes one data set, and one folder to write",
             hint="dexkit export SET --out DIR --drop episodes.json",
@@ -196,15 +195,15 @@ def _cleaned(
         origin = Path(drop)
         verdicts = read_verdicts(origin)
         choice, named = by_verdict(source, origin, verdicts, ["review"] if review else [])
-    result = export_cleaned(source, targets[0], choice, named)
+    result = export_cleaned(source, out, choice, named)
     remarks("warning", result.problems)
     remarks("note", result.notes)
     if as_json:
-        done = {"source": str(source), "folder": str(targets[0]), **asdict(result)}
+        done = {"source": str(source), "folder": str(out), **asdict(result)}
         click.echo(json.dumps({"exported": [done], "refused": []}, indent=1))
         return 1 if result.problems else 0
     kept, gone = result.kept, len(result.dropped)
-    click.echo(one_line(f"{targets[0]}: {kept} episodes kept, {gone} dropped", REMARK))
+    click.echo(one_line(f"{out}: {kept} episodes kept, {gone} dropped", REMARK))
     for dropped in result.dropped[:_SHOWN]:
         reasons = " ".join(dropped.reasons) or "as you said"
         click.echo(one_line(f"  dropped {dropped.episode}: {reasons}", REMARK))
