@@ -126,9 +126,9 @@ def test_an_audit_writes_no_credentials(
             check(written(tmp_path / form))
         again = Audit(locations, tmp_path / "jsonl", parquet=False).run(in_this_process)
         assert (again.done, again.reused) == (10, 7)
-        rows = [json.loads(line) for line in (tmp_path / "jsonl/files.jsonl").open()]
-        assert len({row["file"] for row in rows}) == 10
-        assert f"http://***@{host}/good.mcap [" in "".join(row["file"] for row in rows)
+        rows = [json.loads(line) for line in (tmp_path / "jsonl/episodes.jsonl").open()]
+        assert len({row["episode"] for row in rows}) == 10
+        assert f"http://***@{host}/good.mcap [" in "".join(row["episode"] for row in rows)
         states = {row["state"] for row in rows}
         assert states == {"judged", "gone", "no permission", "unreadable"}
     check("".join(capsys.readouterr()))
