@@ -123,10 +123,10 @@ def audited(folder: Path) -> Path:
     before = Path.cwd()
     os.chdir(sets)  # so that names on the page are short
     try:
-        Audit(["pick_dex1", "toast_dex3", "xr_dex3"], folder / "audit").run(in_this_process)
+        Audit(["pick_dex1", "toast_dex3", "xr_dex3"], Path("audit-out")).run(in_this_process)
     finally:
         os.chdir(before)
-    return folder / "audit/summary.html"
+    return sets / "audit-out/summary.html"
 
 
 def save(png: bytes, name: str) -> None:

@@ -206,4 +206,11 @@ def _falls(r: Relation, grip: _Grip, values: Floats, rest: NDArray[np.bool_]) ->
     return int(at[np.argmax(falls)]) if falls.any() else None
 
 
-CHECKS = (Check("grasp", "Grasps that hold", frozenset({Data.STATE, Data.ACTION}), _grasps),)
+CHECKS = (
+    Check(
+        "grasp",
+        "Objects that are lost, or not there to be held",
+        frozenset({Data.STATE, Data.ACTION}),
+        _grasps,
+    ),
+)
