@@ -255,13 +255,13 @@ def _short(session: Session, side: str, random: Random) -> None:
 
 
 def _late(session: Session, side: str, random: Random) -> None:
-    """Every twentieth state is published 18 ms late, and those that follow catch up."""
+    """Every fiftieth state is published 46 ms late, and those that follow catch up."""
     states = session.topic(side, "/state")
-    late = np.arange(len(states.log)) % 20 < 9
+    late = np.arange(len(states.log)) % 50 < 23
     for times in (states.log, states.publish):
         held = times.copy()
-        held[late] = np.maximum.accumulate(np.where(late, np.roll(times, -9), 0))[late]
-        times[:] = np.maximum.accumulate(held) + np.arange(len(times)) % 20
+        held[late] = np.maximum.accumulate(np.where(late, np.roll(times, -23), 0))[late]
+        times[:] = np.maximum.accumulate(held) + np.arange(len(times)) % 50
 
 
 def _strong(session: Session, side: str, random: Random) -> None:
@@ -299,7 +299,7 @@ FAULTS = (
     Fault("order", _order, ("ORDER-01",)),
     Fault("turned", _turned, ("FIELD-04", "FIELD-16"), ("FIELD-17",)),
     Fault("short", _short, ("FIELD-01",)),
-    Fault("late", _late, ("RATE-03",), ("RATE-01", "FRESH-01")),
+    Fault("late", _late, ("RATE-03",), ("RATE-01", "FRESH-01", "FIELD-17")),
     Fault("strong", _strong, ("FORCE-04", "FORCE-02"), ("FORCE-07",)),
     Fault("cut", spoil=_cut, state="truncated"),
     Fault("damage", spoil=_damage, state="damaged"),
