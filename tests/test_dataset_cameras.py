@@ -17,7 +17,7 @@ from dexkit.conformance.dataset import cameras as decoding
 from dexkit.conformance.dataset.camera_lag import motion_of
 from dexkit.conformance.dataset.camera_sets import never_moving
 from dexkit.conformance.dataset.cameras import CameraTrack, not_judged, picture, tracks_of
-from dexkit.conformance.dataset.checks.cameras import camera_findings
+from dexkit.conformance.dataset.checks import cameras
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.judge import judge
@@ -119,6 +119,11 @@ def episode_with(
         ],
         folder=folder,
     )
+
+
+def camera_findings(episode: Episode) -> list[Finding]:
+    found = [each for check in cameras.CHECKS for each in check.run(episode)]
+    return [each for each in found if isinstance(each, Finding)]
 
 
 def reasons(episode: Episode) -> list[tuple[str, Use, str]]:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from msgspec import structs
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
@@ -25,7 +26,7 @@ from dexkit.conformance.dataset.motion import runs_of
 from dexkit.escaping import one_line
 from dexkit.hand import Floats
 
-__all__ = ["CHECKS", "camera_findings", "frozen", "late", "missing"]
+__all__ = ["CHECKS", "frozen", "late", "missing"]
 
 Mask = NDArray[np.bool_]
 
@@ -470,24 +471,7 @@ def _merged(findings: Sequence[Finding], cameras: int) -> Iterator[Finding]:
     text = f"all {cameras} cameras: {first.text}" + (
         " (the first of them)" if len({f.text for f in findings}) > 1 else ""
     )
-    yield Finding(
-        first.check,
-        first.use,
-        text,
-        "",
-        (),
-        first.begin_s,
-        first.end_s,
-        first.value,
-        first.limit,
-        first.unit,
-    )
-
-
-def camera_findings(episode: Episode) -> Iterator[Finding]:
-    """What is wrong with the cameras of an episode."""
-    for check in CHECKS:
-        yield from (f for f in check.run(episode) if isinstance(f, Finding))
+    yield structs.replace(first, text=text, part="")
 
 
 CHECKS = (

@@ -420,19 +420,23 @@ def _fps(episode: Episode) -> Iterator[Finding]:
     if episode.measured and len(episode) > 8:
         rate = 1 / float(np.median(np.diff(episode.t)))
         if abs(rate / episode.fps - 1) > _OFF:
-            yield Finding(
-                "fps",
-                Use.REVIEW,
-                f"its times are those of {rate:.3g} frames per second, and {episode.fps:g} are "
-                "stated: all speeds are wrong by this where the stated rate is used",
-                value=round(rate, 3),
-                limit=episode.fps,
-                unit="Hz",
-            )
+            yield _other_rate(rate, episode.fps)
             return
     yield from _stamps(episode)
     yield from _speed_limits(episode)
     yield from _velocities(episode)
+
+
+def _other_rate(rate: float, stated: float) -> Finding:
+    return Finding(
+        "fps",
+        Use.REVIEW,
+        f"its times are those of {rate:.3g} frames per second, and {stated:g} are stated: all "
+        "speeds are wrong by this where the stated rate is used",
+        value=round(rate, 3),
+        limit=stated,
+        unit="Hz",
+    )
 
 
 def _stamps(episode: Episode) -> Iterator[Finding]:
@@ -464,15 +468,7 @@ def _stamps(episode: Episode) -> Iterator[Finding]:
             usual = median(steps / ahead)
     rate = 1 / usual
     if abs(rate / episode.fps - 1) > _OFF:
-        yield Finding(
-            "fps",
-            Use.REVIEW,
-            f"its times are those of {rate:.3g} frames per second, and {episode.fps:g} are stated: "
-            "all speeds are wrong by this",
-            value=round(rate, 3),
-            limit=episode.fps,
-            unit="Hz",
-        )
+        yield _other_rate(rate, episode.fps)
         return
     off = np.abs(steps - usual)
     spread = float(np.partition(off, 3 * len(off) // 4)[3 * len(off) // 4]) / usual
