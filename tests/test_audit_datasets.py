@@ -215,7 +215,7 @@ def test_findings_of_the_comparison_count(
     assert ended.value.code == 1
     text = "".join(capsys.readouterr())
     assert "3 of 3 episodes, 0.00 h: 2 keep, 0 review, 1 drop" in text
-    assert "1 sets whose metadata" in text
+    assert "1 dataset whose metadata" in text
     assert "--drop" in text
     assert "lerobot-edit-dataset" in text
     out = tmp_path / "audit-out"
@@ -228,5 +228,7 @@ def test_findings_of_the_comparison_count(
     assert (dropped["episode"], dropped["reasons"]) == (2, ["it is episode 0 again"])
 
 
-def test_nothing_found_names_what_is_looked_for(tmp_path: Path) -> None:
+def test_a_folder_without_episodes_has_none(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()  # of no dataset
+    (tmp_path / "notes.jsonl").write_text("{}")
     assert list(find(str(tmp_path))) == []

@@ -268,7 +268,7 @@ def test_an_inverted_joint_is_found(part: str) -> None:
 # -- metadata ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tasks", [[], [""], ["TODO"], ["N/A"], [" none "]])
+@pytest.mark.parametrize("tasks", [[], [""], ["todo"], ["N/A"], [" none "]])
 def test_a_missing_task_is_found(tasks: list[str]) -> None:
     assert only(replace(made(), tasks=tasks), "task").use is Use.REVIEW
 

@@ -169,7 +169,7 @@ def _print(console: Console, outcome: AuditProgress) -> None:
             f"{outcome.warned} with a warning"
         )
     if outcome.sets:
-        tell(f"{outcome.sets} sets whose metadata are to be looked at")
+        tell(f"{outcome.sets} dataset{'s' * (outcome.sets > 1)} whose metadata are to be looked at")
     if outcome.reused:
         tell(f"{outcome.reused:,} unchanged since the last audit")
     if outcome.examined_s and outcome.seconds:
