@@ -16,7 +16,7 @@ from dexkit.conformance.audit import objects
 from dexkit.conformance.audit.audit import Audit, AuditProgress, in_this_process
 from dexkit.conformance.audit.examine import Task, examine
 from dexkit.conformance.audit.journal import Journal
-from dexkit.conformance.audit.records import EpisodeRecord, Finding, State
+from dexkit.conformance.audit.records import EpisodeRecord, RequirementFinding, State
 from dexkit.conformance.audit.result_tables import EPISODE, FINDINGS, have_parquet
 from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.units import Unit, find
@@ -330,7 +330,9 @@ def test_summary_page_lists_worst_files_and_trends(tmp_path: Path) -> None:
     for day in range(1, 5):
         for name, verdict in (("good", "pass"), ("<b>bad", "fail")):
             row = ["hand", "DEX1-RATE-03", "MUST", "drop-in", "left", verdict, "", "a gap"]
-            finding = to_record([*row, "", "", None, None, "", "", None, None], Finding, "it")
+            finding = to_record(
+                [*row, "", "", None, None, "", "", None, None], RequirementFinding, "it"
+            )
             summary.add(
                 EpisodeRecord(
                     f"{day}/{name}.mcap",

@@ -19,8 +19,7 @@ from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.units import Form, Unit, find, together
 from dexkit.conformance.audit.workers import Pool, WorkerLost
 from dexkit.conformance.dataset.across import across
-from dexkit.conformance.dataset.findings import Finding as TrainingFinding
-from dexkit.conformance.dataset.findings import Judgement, Use, use_of
+from dexkit.conformance.dataset.findings import Finding, Judgement, Use, use_of
 from dexkit.conformance.dataset.whole_set import WholeSet
 from dexkit.conformance.kit.results import Overall, Verdict
 from dexkit.documents import write_file
@@ -316,16 +315,14 @@ class Audit:
         outcome.files += [listing, page]
         outcome.commands = commands
 
-    def _compared(
-        self, journal: Journal, names: Sequence[str]
-    ) -> Mapping[str, Sequence[TrainingFinding]]:
+    def _compared(self, journal: Journal, names: Sequence[str]) -> Mapping[str, Sequence[Finding]]:
         """What a comparison of the episodes with each other, and with their metadata, finds."""
         judged: dict[str, dict[str, Judgement]] = {}
         for record in journal.records(names):
             if record.judgement is not None:
                 light = structs.replace(record.judgement, curves=[], shots=[])
                 judged.setdefault(record.source, {})[record.name] = light
-        found: dict[str, list[TrainingFinding]] = {}
+        found: dict[str, list[Finding]] = {}
         for source, judgements in judged.items():
             for name, findings in across(judgements, self._sets.get(source)).items():
                 found.setdefault(name, []).extend(findings)

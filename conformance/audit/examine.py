@@ -16,7 +16,7 @@ import numpy as np
 
 from dexkit import __version__
 from dexkit.conformance.audit.objects import file_system
-from dexkit.conformance.audit.records import EpisodeRecord, Finding, State
+from dexkit.conformance.audit.records import EpisodeRecord, RequirementFinding, State
 from dexkit.conformance.audit.sessions import is_url, opened, problem_of
 from dexkit.conformance.audit.units import Form, Unit, fetch, tag_of_metadata
 from dexkit.conformance.dataset.cameras import not_judged
@@ -281,8 +281,8 @@ def _judged(
         judgement=judgement,
         facts=facts,
         findings=[
-            *(Finding.of(r, about) for r in result.results),
-            *(Finding.of(r, "client") for r in result.client),
+            *(RequirementFinding.of(r, about) for r in result.results),
+            *(RequirementFinding.of(r, "client") for r in result.client),
         ],
     )
 

@@ -10,14 +10,13 @@ from typing import Any
 import msgspec
 from msgspec import structs
 
-from dexkit.conformance.dataset.findings import Finding as TrainingFinding
-from dexkit.conformance.dataset.findings import Judgement, Use, use_of
+from dexkit.conformance.dataset.findings import Finding, Judgement, Use, use_of
 from dexkit.conformance.kit.requirements import Kind, Level
 from dexkit.conformance.kit.results import Overall, Result, Verdict, worst
 from dexkit.errors import UsageError
 from dexkit.records import as_plain, to_record
 
-__all__ = ["FORMAT", "VERSION", "EpisodeRecord", "Finding", "State"]
+__all__ = ["FORMAT", "VERSION", "EpisodeRecord", "RequirementFinding", "State"]
 
 FORMAT = "dexkit-audit"
 VERSION = 3
@@ -27,7 +26,7 @@ VERSION = 3
 _DROP = 1000  # failed requirements that count as much as an episode that is to be dropped
 
 
-class Finding(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class RequirementFinding(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """One requirement on one side of a recording of the wire.
 
     :param about: ``hand``, ``robot`` or ``client``.
@@ -55,7 +54,7 @@ class Finding(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_field
     evidence_end_s: float | None
 
     @classmethod
-    def of(cls, result: Result, about: str) -> Finding:
+    def of(cls, result: Result, about: str) -> RequirementFinding:
         """The row of a result."""
         place = result.evidence[0] if result.evidence else None
         measure = result.measure
@@ -145,7 +144,7 @@ class EpisodeRecord(msgspec.Struct, forbid_unknown_fields=True):
     client: str = ""
     exit_code: int = 2
     facts: dict[str, Any] = {}
-    findings: list[Finding] = []
+    findings: list[RequirementFinding] = []
     source: str = ""
     episode: str = ""
     form: str = ""
@@ -190,7 +189,7 @@ class EpisodeRecord(msgspec.Struct, forbid_unknown_fields=True):
         """Keep, review or drop; empty where that could not be judged."""
         return "" if self.judgement is None else str(self.judgement.use)
 
-    def with_findings(self, found: Sequence[TrainingFinding]) -> EpisodeRecord:
+    def with_findings(self, found: Sequence[Finding]) -> EpisodeRecord:
         """The record with findings of a comparison with other episodes."""
         if not found or self.judgement is None:
             return self

@@ -16,9 +16,8 @@ from typing import Any
 import msgspec
 from msgspec import structs
 
-from dexkit.conformance.audit.records import EpisodeRecord, Finding
-from dexkit.conformance.dataset.findings import Finding as TrainingFinding
-from dexkit.conformance.dataset.findings import Judgement
+from dexkit.conformance.audit.records import EpisodeRecord, RequirementFinding
+from dexkit.conformance.dataset.findings import Finding, Judgement
 from dexkit.documents import write_file
 from dexkit.errors import UsageError
 from dexkit.escaping import output_error
@@ -79,7 +78,10 @@ _OF_EPISODE = (
 )
 FINDINGS: dict[str, type] = {
     **{name: EPISODE[name] for name in _OF_EPISODE},
-    **{f.name: float if f.type == float | None else str for f in msgspec.structs.fields(Finding)},
+    **{
+        f.name: float if f.type == float | None else str
+        for f in msgspec.structs.fields(RequirementFinding)
+    },
 }
 """Columns of ``findings``."""
 _BATCH = 200  # episodes whose rows are held at once
@@ -139,7 +141,7 @@ def finding_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
     return [{**found, **about} for found in rows]
 
 
-def _training_row(finding: TrainingFinding) -> dict[str, Any]:
+def _training_row(finding: Finding) -> dict[str, Any]:
     """A finding about training in the columns of a requirement: its check, part and use are the
     requirement, side and verdict.
     """

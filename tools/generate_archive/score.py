@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit.conformance.audit.journal import Journal
-from dexkit.conformance.audit.records import EpisodeRecord, Finding, State
+from dexkit.conformance.audit.records import EpisodeRecord, RequirementFinding, State
 from tools.generate_archive import ANSWERS, Answer
 
 __all__ = ["Score", "score"]
@@ -101,8 +101,8 @@ def _finds(answer: Answer, record: EpisodeRecord) -> bool:
 
 
 def _failed(
-    findings: Iterable[Finding], verdicts: tuple[str, ...] = ("fail",)
-) -> Iterable[Finding]:
+    findings: Iterable[RequirementFinding], verdicts: tuple[str, ...] = ("fail",)
+) -> Iterable[RequirementFinding]:
     for finding in findings:
         if finding.verdict in verdicts and finding.about != "client":
             yield finding
