@@ -48,13 +48,12 @@ from tools.spoiled_sets.e_faults import (
     turned,
 )
 from tools.spoiled_sets.e_files import (
+    AUTHOR,
     Entry,
     Set,
     Wire,
     dexkit,
     write_export,
-    write_json,
-    write_lerobot,
     write_session,
     write_wire,
     write_xr,
@@ -67,6 +66,7 @@ from tools.spoiled_sets.e_motion import (
     load_library,
     make,
 )
+from tools.spoiled_sets.lerobot_files import write_json, write_lerobot
 
 
 def good(say: str, *, seed: int = -1, task: int = 0, **style: Any) -> Entry:
@@ -171,8 +171,8 @@ SETS = (
             camera("cam_left_high", "late", 2.5), seconds=15),
         bad("duplicate", "plain", "A copy of episode 1.", marked("", 0, 1), copied=1),
         bad("wrong_stats", "plain", "The statistics are those of degrees, the data are rad.",
-            told("wrong stats", 57.3)),
-        bad("broken_file", "plain", "Its Parquet file is cut in half.", told("half file")),
+            told("stats", (57.3, 0.4))),
+        bad("broken_file", "plain", "Its Parquet file is cut in half.", told("half", 0.5)),
         bad("broken_file", "moderate", "Its Parquet file has 7 rows fewer than the metadata say.",
             told("rows", 7)),
         bad("no_task", "plain", "The task is an empty text.", told("no task")),
@@ -232,7 +232,7 @@ SETS = (
         bad("missing_stretch", "plain", "2 s of frames are missing, the numbers and stamps show "
             "it.", missing(2.0, False)),
         bad("wrong_stats", "plain", "The statistics in the metadata are of other data.",
-            told("wrong stats", 3.0)),
+            told("stats", (3.0, 0.4))),
         bad("no_task", "plain", "The task is an empty text.", told("no task")),
     ), tasks=("Wipe the table with the sponge.",), base={"touch": 0.58}),
     Set("export_dex3", "export", "dex3-1", 30, (
@@ -505,7 +505,7 @@ def write_all(out: Path) -> None:
         elif made.form == "export":
             write_export(root, made, takes)
         else:
-            write_lerobot(root, made, takes)
+            write_lerobot(AUTHOR, root, made, takes)
         form = "lerobot-v3.0" if made.form == "export" else f"lerobot-{made.form}"
         form = made.form.replace(" ", "-") if xr else form
         if made.name == "no_metadata":

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.spoiled_sets.g_files import (
-    SIDES,
     Rng,
     Set,
     Take,
@@ -33,6 +32,7 @@ from tools.spoiled_sets.g_files import (
     write_lerobot,
     write_xr,
 )
+from tools.spoiled_sets.lerobot_files import SIDES
 
 # -- faults -----------------------------------------------------------------------------------
 
